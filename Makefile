@@ -1,0 +1,70 @@
+# Everything runs in .venv, which is made on first use and again when its requirements change.
+
+PYTHON ?= python3
+TORCH ?= 2.13.0
+
+VENV := .venv
+BIN := $(VENV)/bin
+PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
+
+.DEFAULT_GOAL := help
+.DELETE_ON_ERROR:
+.PHONY: help run test test-slow check format speed constraints clean
+
+help: ## List the targets
+	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
+	while IFS='|' read -r target text; do printf '%-20s %s\n' "  $$target" "$$text"; done
+
+run: $(VENV)/.stamp-run ## Drive the reference policy on the infinity preset, into results/infinity
+	$(BIN)/tlf run infinity --out results/infinity
+
+test: check ## Check, then run the tests
+	$(BIN)/pytest
+
+test-slow: $(VENV)/.stamp-test ## Run the long tests
+	$(BIN)/pytest -m slow
+
+check: $(VENV)/.stamp-test ## Lint, check the format and the types
+	$(BIN)/ruff check
+	$(BIN)/ruff format --check
+	$(BIN)/mypy
+
+format: $(VENV)/.stamp-test ## Sort the imports and format the sources
+	$(BIN)/ruff check --select I --fix
+	$(BIN)/ruff format
+
+speed: $(VENV)/.stamp-run ## Measure the steps per second
+	$(BIN)/tlf speed
+
+# torch is fixed by hand (make constraints TORCH=...), and everything else is resolved anew. What
+# torch requires on one kind of machine only is left out.
+constraints: ## Write constraints.txt anew, from a throw-away environment with every extra
+	@set -e; \
+	tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \
+	$(PYTHON) -m venv "$$tmp/venv"; \
+	py="$$tmp/venv/bin/python"; \
+	"$$py" -m pip install -q --disable-pip-version-check "torch==$(TORCH)" \
+		build editables hatchling ".[figures,view,train,bench,ray,dev]"; \
+	"$$py" -m pip check; \
+	echo "# Versions of everything that the extras install. Made by: make constraints" > "$$tmp/new"; \
+	"$$py" -m pip freeze --all --exclude pip --exclude tlf-env > "$$tmp/frozen"; \
+	sed -e '/^\(cuda-\|nvidia-\|triton\)/d' -e 's/+[A-Za-z0-9.]*$$//' "$$tmp/frozen" >> "$$tmp/new"; \
+	cp "$$tmp/new" constraints.txt
+
+clean: ## Remove .venv, caches and built packages (results are kept)
+	rm -rf $(VENV) .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist
+	find . -name __pycache__ -type d -prune -exec rm -rf {} +
+
+$(VENV)/.stamp-venv:
+	@$(PYTHON) -c 'import sys; sys.version_info >= (3, 11) or sys.exit("Python 3.11 or newer is needed")'
+	$(PYTHON) -m venv $(VENV)
+	@touch $@
+
+$(VENV)/.stamp-run: $(VENV)/.stamp-venv pyproject.toml constraints.txt
+	$(PIP) -c constraints.txt -e ".[figures]"
+	@touch $@
+
+# mpe2 is named alone: the extra `bench` would bring vmas, and vmas brings torch.
+$(VENV)/.stamp-test: $(VENV)/.stamp-run
+	$(PIP) -c constraints.txt -e ".[figures,dev]" mpe2
+	@touch $@

@@ -1,0 +1,1 @@
+"""What every other room may use: compilation, random numbers, angles. Knows nothing of robots."""

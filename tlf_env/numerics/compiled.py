@@ -1,0 +1,103 @@
+"""How the laws and the step drivers are compiled, and where the result is kept.
+
+A *law* is a scalar function (floats and named tuples of floats in, the same out). It is inlined into
+whatever calls it, so that a law exists once and costs no call. A *driver* knows arrays; it is what
+Python calls, and it is cached on disk.
+
+Numba's own cache looks only at the file that holds a function, not at the files which that function
+imports from. Here the folder of the cache is named by a hash over every source that can hold a law,
+so that an edit anywhere gives a new folder. The folder lies in the user's cache, never beside the
+sources: an installation may be read-only.
+"""
+
+from __future__ import annotations
+
+import functools
+import hashlib
+import os
+import tempfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import numba
+import platformdirs
+
+F = TypeVar("F", bound=Callable[..., Any])
+
+PACKAGE = Path(__file__).resolve().parent.parent
+ROOMS_WITH_LAWS = ("numerics", "physics", "onboard", "task")
+
+
+@functools.cache
+def sources_digest() -> str:
+    """Hexadecimal digest of every source file that can hold a law, in a fixed order."""
+    digest = hashlib.sha256(numba.__version__.encode())
+    for room in ROOMS_WITH_LAWS:
+        for path in sorted((PACKAGE / room).glob("*.py")):
+            digest.update(f"{room}/{path.name}\0".encode())
+            digest.update(path.read_bytes())
+    return digest.hexdigest()[:20]
+
+
+@functools.cache
+def cache_folder() -> Path:
+    """Folder of the compiled drivers; ``TLF_ENV_CACHE`` names another parent.
+
+    Falls back to a private folder below the system's temporary one where the user's cache cannot be
+    written, so that a driver is compiled once per machine and not once per process.
+    """
+    parent = os.environ.get("TLF_ENV_CACHE") or platformdirs.user_cache_dir("tlf_env")
+    folder = Path(parent) / sources_digest()
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return folder
+    except OSError:
+        user = os.getuid() if hasattr(os, "getuid") else "user"
+        folder = Path(tempfile.gettempdir()) / f"tlf_env-{user}" / sources_digest()
+        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        return folder
+
+
+def law(function: F) -> F:
+    """Compile a scalar law so that it is inlined into its callers.
+
+    Division by zero gives infinity as in NumPy (no branch per division), and no fast-math: two
+    drivers that inline the same law must agree to the last bit.
+    """
+    compiled: F = numba.njit(error_model="numpy", forceinline=True, nogil=True)(function)
+    return compiled
+
+
+def block(function: F) -> F:
+    """Compile a larger law that is called rather than inlined, to keep compile times short."""
+    compiled: F = numba.njit(error_model="numpy", nogil=True)(function)
+    return compiled
+
+
+def driver(function: F) -> F:
+    """Compile a function over arrays, and keep the result on disk."""
+    before = numba.config.CACHE_DIR
+    numba.config.CACHE_DIR = str(cache_folder())  # read when the cache object is made, just below
+    try:
+        compiled: F = numba.njit(error_model="numpy", nogil=True, cache=True)(function)
+    finally:
+        numba.config.CACHE_DIR = before
+    return compiled
+
+
+def reader(row: type[NamedTuple]) -> Callable[..., Any]:  # type: ignore[valid-type]
+    """Compiled ``read(array, robot, lane)`` that gathers a named tuple from ``array[field, robot, lane]``."""
+    fields = ", ".join(f"a[{i}, r, l]" for i in range(len(row._fields)))
+    scope: dict[str, Any] = {"Row": row}
+    exec(f"def read(a, r, l):\n    return Row({fields})\n", scope)
+    return law(scope["read"])
+
+
+def writer(row: type[NamedTuple]) -> Callable[..., Any]:  # type: ignore[valid-type]
+    """Compiled ``write(array, robot, lane, row)``, the inverse of :func:`reader`."""
+    lines = "\n".join(f"    a[{i}, r, l] = row.{name}" for i, name in enumerate(row._fields))
+    scope: dict[str, Any] = {}
+    exec(f"def write(a, r, l, row):\n{lines}\n", scope)
+    return law(scope["write"])

@@ -1,0 +1,65 @@
+"""Delayed-dynamics observer of time-gap leader-follower formation (TLF), eqs (42)–(51)."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from tlf_env.numerics.angles import wrap
+from tlf_env.numerics.compiled import law
+from tlf_env.physics.parameters import Frozen, Positive
+
+
+class ObserverParameters(Frozen):
+    """Gain b = b₁ = b₂ = b₃ (1/s) and the smoothing time of eq. (51) (s)."""
+
+    gain_per_s: Positive = 3.0
+    smoothing_s: Positive = 5.0
+
+
+class Message(NamedTuple):
+    """What a robot broadcasts: estimated pose of c (mm, rad) and twist (mm/s, rad/s)."""
+
+    x: float
+    y: float
+    theta: float
+    u_1: float
+    u_2: float
+
+
+class Reference(NamedTuple):
+    """What a robot follows, eq. (50): pose (mm, rad) and twist u₁*, u₂* (mm/s, rad/s)."""
+
+    x: float
+    y: float
+    theta: float
+    u_1: float
+    u_2: float
+
+
+@law
+def smoothing(t: float, duration: float) -> float:
+    """℘ of eq. (51): rises from 0 to 1 over ``duration`` s."""
+    if t >= duration:
+        return 1.0
+    return 0.5 * (1.0 - math.cos(math.pi * t / duration))
+
+
+@law
+def observer_rates(
+    x: float, y: float, theta: float, delayed: Message, gain: float, factor: float
+) -> tuple[float, float, float]:
+    """Eq. (43) times ℘: rates of the observer's pose for the predecessor's delayed message."""
+    return (
+        factor * (-delayed.u_1 * math.sin(theta) + gain * (delayed.x - x)),
+        factor * (delayed.u_1 * math.cos(theta) + gain * (delayed.y - y)),
+        factor * (delayed.u_2 + gain * wrap(delayed.theta - theta)),
+    )
+
+
+@law
+def observed_reference(
+    x: float, y: float, theta: float, rate_x: float, rate_y: float, rate_theta: float
+) -> Reference:
+    """Eq. (50): the observer's pose and the twist it moves with."""
+    return Reference(x, y, theta, math.sqrt(rate_x * rate_x + rate_y * rate_y), rate_theta)

@@ -1,0 +1,76 @@
+"""Angular velocity controller (AVC) of one drive wheel, eq. (13), in N·mm per rad/s.
+
+K(s) = k (s² + a₁ s + a₀) / (s (s + p)) = k + k_i / s + k_p / (s + p), with the exact partial fractions
+k_i = k a₀ / p and k_p = k (p² − a₁ p + a₀) / (−p). With the printed numbers these are 22.69 and 127.31;
+the paper rounds them to 22 and 128.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Frozen, Positive
+
+
+class WheelLoopParameters(Frozen):
+    """Eq. (13): ``gain`` (s² + ``zeros_1`` s + ``zeros_0``) / (s (s + ``pole``)), N·mm per rad/s."""
+
+    gain_Nmm_s: Positive = 150.0
+    zeros_1: Positive = 3.0
+    zeros_0: Positive = 0.3025
+    pole_rad_s: Positive = 2.0
+
+
+class WheelLoop(NamedTuple):
+    """Digital form of eq. (13), torques in mN·mm: gain, integral step, lag decay and lag step."""
+
+    gain: float
+    integral_step: float
+    lag_decay: float
+    lag_step: float
+
+
+class WheelLoopState(NamedTuple):
+    """Torques held by the integrator and the lag of each wheel, mN·mm."""
+
+    integral_l: float
+    lag_l: float
+    integral_r: float
+    lag_r: float
+
+
+read_wheel_loop = reader(WheelLoop)
+read_loop_state = reader(WheelLoopState)
+write_loop_state = writer(WheelLoopState)
+
+
+def digital_wheel_loop(p: WheelLoopParameters, dt_s: float) -> WheelLoop:
+    """Zero-order-hold form of eq. (13) at a period of ``dt_s`` s."""
+    integral = p.gain_Nmm_s * p.zeros_0 / p.pole_rad_s
+    lag = -p.gain_Nmm_s * (p.pole_rad_s**2 - p.zeros_1 * p.pole_rad_s + p.zeros_0) / p.pole_rad_s
+    decay = math.exp(-p.pole_rad_s * dt_s)
+    return WheelLoop(
+        p.gain_Nmm_s * MILLINEWTON_PER_NEWTON,
+        integral * dt_s * MILLINEWTON_PER_NEWTON,
+        decay,
+        lag * (1 - decay) / p.pole_rad_s * MILLINEWTON_PER_NEWTON,
+    )
+
+
+@law
+def wheel_torque(
+    error: float, integral: float, lag: float, loop: WheelLoop, limit: float
+) -> tuple[float, float, float]:
+    """Torque for a speed error in rad/s; returns ``(torque, integral, lag)``, torque within ±``limit``.
+
+    Anti-windup: while the torque is at its limit and the error asks for more, integrator and lag hold.
+    """
+    next_integral = integral + loop.integral_step * error
+    next_lag = loop.lag_decay * lag + loop.lag_step * error
+    torque = loop.gain * error + next_integral + next_lag
+    limited = min(max(torque, -limit), limit)
+    if torque != limited and error * torque > 0.0:
+        return limited, integral, lag
+    return limited, next_integral, next_lag

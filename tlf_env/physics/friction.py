@@ -1,0 +1,71 @@
+"""Friction laws: the coefficient's curve, joint friction of eq. (5), and a Coulomb disc solved exactly."""
+
+from __future__ import annotations
+
+import math
+
+from tlf_env.numerics.compiled import law
+
+NEWTON_STEPS = 60
+CIRCLE_TOLERANCE = 1e-14
+
+
+@law
+def coefficient(
+    speed: float, mu_static: float, mu_dynamic: float, stiction_speed: float, dynamic_speed: float
+) -> float:
+    """μ(|v|) of Fig. 3(b): static up to v_s, dynamic from v_d on, a cubic step between. Speeds in mm/s."""
+    x = (abs(speed) - stiction_speed) / (dynamic_speed - stiction_speed)
+    x = min(max(x, 0.0), 1.0)
+    return mu_static + (mu_dynamic - mu_static) * x * x * (3.0 - 2.0 * x)
+
+
+@law
+def joint_torque(
+    mu: float,
+    axial_arm: float,
+    radial_arm: float,
+    bending_ratio: float,
+    preload: float,
+    axial: float,
+    radial: float,
+    moment: float,
+) -> float:
+    """Largest friction torque of a joint, eq. (5), in mN·mm; forces in mN, arms in mm, moment in mN·mm."""
+    return mu * (axial_arm * abs(axial) + radial_arm * radial + bending_ratio * abs(moment) + preload)
+
+
+@law
+def disc(
+    w_ee: float, w_ff: float, w_ef: float, b_e: float, b_f: float, radius: float
+) -> tuple[float, float, float]:
+    """Impulse of one tyre within its friction circle.
+
+    ``W = [[w_ee, w_ef], [w_ef, w_ff]]`` is the contact's inverse mass and ``b`` its slip velocity
+    without the impulse. Returns ``(p_e, p_f, λ)`` with slip = b + W p: either slip = 0 and |p| ≤ radius
+    (λ = 0), or |p| = radius and slip = −λ p: the impulse opposes the slip exactly.
+    """
+    if radius <= 0.0:
+        return 0.0, 0.0, math.inf
+    det = w_ee * w_ff - w_ef * w_ef
+    p_e = -(w_ff * b_e - w_ef * b_f) / det
+    p_f = -(w_ee * b_f - w_ef * b_e) / det
+    norm = math.sqrt(p_e * p_e + p_f * p_f)
+    if norm <= radius:
+        return p_e, p_f, 0.0
+    # Find λ with |(W + λ1)⁻¹ b| = radius: Newton on 1/|p|, from a bound at or below the root.
+    largest = 0.5 * (w_ee + w_ff) + math.sqrt(0.25 * (w_ee - w_ff) ** 2 + w_ef * w_ef)
+    lam = max(0.0, math.sqrt(b_e * b_e + b_f * b_f) / radius - largest)
+    for _ in range(NEWTON_STEPS):
+        a, c = w_ee + lam, w_ff + lam
+        det = a * c - w_ef * w_ef
+        p_e = -(c * b_e - w_ef * b_f) / det
+        p_f = -(a * b_f - w_ef * b_e) / det
+        norm = math.sqrt(p_e * p_e + p_f * p_f)
+        excess = norm - radius
+        if abs(excess) <= CIRCLE_TOLERANCE * radius:
+            break
+        curvature = (c * p_e * p_e - 2.0 * w_ef * p_e * p_f + a * p_f * p_f) / det
+        lam = max(0.0, lam + norm * norm / curvature * excess / radius)
+    scale = radius / norm
+    return p_e * scale, p_f * scale, lam

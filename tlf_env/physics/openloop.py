@@ -1,0 +1,220 @@
+"""One robot driven with given torques: no wheel loop, no torque limit. For checks against other plants."""
+
+from __future__ import annotations
+
+import json
+import math
+from pathlib import Path
+from typing import Annotated, Any, Self
+
+import numpy as np
+from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
+
+from tlf_env.numerics.compiled import driver
+from tlf_env.numerics.errors import one_line
+from tlf_env.physics.kernel import (
+    Contact,
+    Floor,
+    Motion,
+    Push,
+    advance_pose,
+    axle_midpoint,
+    read_body,
+    read_contact,
+    read_motion,
+    substep,
+    write_contact,
+    write_motion,
+)
+from tlf_env.physics.parameters import (
+    MILLINEWTON_PER_NEWTON,
+    Frozen,
+    Positive,
+    RobotParameters,
+    body_array,
+)
+
+COLUMNS = (
+    "t_s",
+    "x_mm",
+    "y_mm",
+    "theta_rad",
+    "castor_rad",
+    "forward_mm_s",
+    "right_mm_s",
+    "yaw_rad_s",
+    "omega_l_rad_s",
+    "omega_r_rad_s",
+)
+ROW_EVERY_S = 0.1
+
+
+class OpenLoopStart(Frozen):
+    """State of the axle's midpoint c, the castor and the wheels at t = 0."""
+
+    x_mm: FiniteFloat = 0.0
+    y_mm: FiniteFloat = 0.0
+    theta_rad: FiniteFloat = 0.0
+    castor_rad: FiniteFloat = 0.0
+    forward_mm_s: FiniteFloat = 0.0
+    right_mm_s: FiniteFloat = 0.0
+    yaw_rad_s: FiniteFloat = 0.0
+    omega_l_rad_s: FiniteFloat = 0.0
+    omega_r_rad_s: FiniteFloat = 0.0
+    castor_spin_rad_s: FiniteFloat = 0.0
+
+
+class OpenLoopInput(Frozen):
+    """Torques (N·mm) that hold from ``from_s`` on."""
+
+    from_s: Annotated[FiniteFloat, Field(ge=0)] = 0.0
+    torque_l_Nmm: FiniteFloat
+    torque_r_Nmm: FiniteFloat
+
+
+class OpenLoopScenario(Frozen):
+    """One open-loop run: duration, start, joint friction on or off, torques over time."""
+
+    duration_s: Positive
+    start: OpenLoopStart = OpenLoopStart()
+    joint_friction: bool = True
+    inputs: tuple[OpenLoopInput, ...] = Field(min_length=1)
+
+    @model_validator(mode="after")
+    def _check_order(self) -> Self:
+        times = [one.from_s for one in self.inputs]
+        if any(b <= a for a, b in zip(times, times[1:], strict=False)):
+            raise ValueError(f"inputs: from_s must increase from one to the next, got {times}")
+        return self
+
+
+def initial_rows(start: OpenLoopStart, d_mm: float) -> tuple[np.ndarray, np.ndarray]:
+    """Motion and contact arrays ``(field, 1, 1)`` for a start; the solver's memory is zero."""
+    sin, cos = math.sin(start.theta_rad), math.cos(start.theta_rad)
+    right = start.right_mm_s + start.yaw_rad_s * d_mm
+    motion = Motion(
+        x=start.x_mm + d_mm * sin,
+        y=start.y_mm - d_mm * cos,
+        theta=start.theta_rad,
+        psi=start.theta_rad + start.castor_rad,
+        v_x=right * cos - start.forward_mm_s * sin,
+        v_y=right * sin + start.forward_mm_s * cos,
+        w=start.yaw_rad_s,
+        s=start.yaw_rad_s,
+        omega_l=start.omega_l_rad_s,
+        omega_r=start.omega_r_rad_s,
+        omega_c=start.castor_spin_rad_s,
+        angle_l=0.0,
+        angle_r=0.0,
+    )
+    return (
+        np.array(motion, dtype=np.float64).reshape(-1, 1, 1),
+        np.zeros((len(Contact._fields), 1, 1)),
+    )
+
+
+@driver
+def advance_open_loop(
+    bodies: np.ndarray,
+    motions: np.ndarray,
+    contacts: np.ndarray,
+    torques: np.ndarray,
+    push: np.ndarray,
+    dt: float,
+) -> None:
+    """Advance robot 0 in place by ``len(torques)`` substeps of ``dt`` s; torques (steps, 2) in mN·mm.
+
+    ``push`` is a constant external load at the centre of mass: world force (2,) in mN, torque in mN·mm.
+    """
+    body = read_body(bodies, 0, 0)
+    motion = read_motion(motions, 0, 0)
+    contact = read_contact(contacts, 0, 0)
+    floor = Floor(0.0, 0.0, 1.0, 1.0, 1.0)
+    load = Push(push[0], push[1], push[2])
+    for k in range(torques.shape[0]):
+        motion, contact = substep(
+            body, motion, contact, floor, load, torques[k, 0], torques[k, 1], dt
+        )
+        motion = advance_pose(motion, dt)
+    write_motion(motions, 0, 0, motion)
+    write_contact(contacts, 0, 0, contact)
+
+
+def _row(t_s: float, motion: Motion, d_mm: float) -> list[float]:
+    sin, cos = math.sin(motion.theta), math.cos(motion.theta)
+    x_mm, y_mm = axle_midpoint.py_func(motion, d_mm)
+    return [
+        t_s,
+        x_mm,
+        y_mm,
+        motion.theta,
+        motion.psi - motion.theta,
+        -motion.v_x * sin + motion.v_y * cos,
+        motion.v_x * cos + motion.v_y * sin - motion.w * d_mm,
+        motion.w,
+        motion.omega_l,
+        motion.omega_r,
+    ]
+
+
+def run_open_loop(
+    scenario: OpenLoopScenario,
+    robot: RobotParameters | None = None,
+    dt_s: float = 0.001,
+) -> np.ndarray:
+    """Run one scenario; returns rows ``(time, column)`` every 0.1 s, columns as in :data:`COLUMNS`.
+
+    Raises
+    ------
+    ValueError
+        if ``dt_s`` does not divide 0.1 s.
+    """
+    robot = (robot or RobotParameters()).model_copy(
+        update={"joint_friction": scenario.joint_friction}
+    )
+    per_row = round(ROW_EVERY_S / dt_s)
+    if per_row < 1 or abs(per_row * dt_s - ROW_EVERY_S) > 1e-9:
+        raise ValueError(f"dt_s {dt_s} must divide the {ROW_EVERY_S} s between rows")
+    bodies = body_array([robot])
+    motions, contacts = initial_rows(scenario.start, robot.com_offset_mm)
+    steps = round(scenario.duration_s / dt_s)
+    starts = np.array([round(one.from_s / dt_s) for one in scenario.inputs])
+    levels = np.array([(one.torque_l_Nmm, one.torque_r_Nmm) for one in scenario.inputs])
+    held = np.searchsorted(starts, np.arange(steps), side="right") - 1
+    torques = np.where(held[:, None] >= 0, levels[held], 0.0) * MILLINEWTON_PER_NEWTON
+    push = np.zeros(3)
+
+    rows = [_row(0.0, Motion(*motions[:, 0, 0].tolist()), robot.com_offset_mm)]
+    for first in range(0, steps - steps % per_row, per_row):
+        advance_open_loop(
+            bodies, motions, contacts, torques[first : first + per_row], push, dt_s
+        )
+        t_s = (first + per_row) * dt_s
+        rows.append(_row(t_s, Motion(*motions[:, 0, 0].tolist()), robot.com_offset_mm))
+    return np.array(rows)
+
+
+def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
+    """Read ``{name: scenario}`` from a JSON file.
+
+    Raises
+    ------
+    ValueError
+        in one line, if the file is missing, is not JSON, or holds an impossible scenario.
+    """
+    try:
+        data: Any = json.loads(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not JSON: {error}") from error
+    if not isinstance(data, dict) or not data:
+        raise ValueError(f"{path} must hold an object of named scenarios, got {type(data).__name__}")
+    for name in data:
+        if not name or Path(name).name != name or name.startswith("."):
+            raise ValueError(f"{path}: the scenario name {name!r} cannot be a file name")
+    try:
+        return TypeAdapter(dict[str, OpenLoopScenario]).validate_python(data)
+    except ValidationError as error:
+        raise ValueError(f"{path}: {one_line(error)}") from error
+

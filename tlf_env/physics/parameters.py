@@ -1,0 +1,270 @@
+"""Every number of the robot's body: Table I of the paper, and the values chosen where it is silent.
+
+Units: mm, kg, s, rad; torques and torque limits N·mm; inertias kg·mm².
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, NamedTuple, Self
+
+import numpy as np
+from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
+
+Positive = Annotated[FiniteFloat, Field(gt=0)]
+NonNegative = Annotated[FiniteFloat, Field(ge=0)]
+
+MILLINEWTON_PER_NEWTON = 1000.0
+LOAD_SPLIT_TOLERANCE = 1e-9
+
+
+class Frozen(BaseModel):
+    """A model whose instances never change and that refuses unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
+
+
+class FrictionCurve(Frozen):
+    """Friction coefficient against speed (paper, Fig. 3b): static, then a smooth fall to dynamic.
+
+    ``mu_static`` holds up to ``stiction_speed_mm_s`` (v_s), ``mu_dynamic`` from ``dynamic_speed_mm_s``
+    (v_d) on. At zero speed the law is set-valued: true stick.
+    """
+
+    mu_static: NonNegative
+    mu_dynamic: NonNegative
+    stiction_speed_mm_s: Positive
+    dynamic_speed_mm_s: Positive
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.mu_dynamic > self.mu_static:
+            raise ValueError(
+                f"mu_dynamic {self.mu_dynamic} is above mu_static {self.mu_static}; it must not be"
+            )
+        if self.dynamic_speed_mm_s <= self.stiction_speed_mm_s:
+            raise ValueError(
+                f"dynamic_speed_mm_s {self.dynamic_speed_mm_s} must be above "
+                f"stiction_speed_mm_s {self.stiction_speed_mm_s}"
+            )
+        return self
+
+
+class JointFriction(FrictionCurve):
+    """Friction torque of a revolute joint, eq. (5); the switches of Table I are explicit here."""
+
+    friction_arm_mm: NonNegative  # R_n, lever of the axial force
+    pin_radius_mm: NonNegative  # R_p, lever of the radial force
+    bending_arm_mm: Positive  # R_b, divides the bending moment
+    preload_Nmm: NonNegative = 0.0  # T_pre, off in Table I
+    bending: bool = True  # Table I: bending moment on
+
+
+def _joint(mu_static: float, mu_dynamic: float, arms_mm: tuple[float, float, float]) -> JointFriction:
+    friction_arm_mm, pin_radius_mm, bending_arm_mm = arms_mm
+    return JointFriction(
+        mu_static=mu_static,
+        mu_dynamic=mu_dynamic,
+        stiction_speed_mm_s=1.0,
+        dynamic_speed_mm_s=1.5,
+        friction_arm_mm=friction_arm_mm,
+        pin_radius_mm=pin_radius_mm,
+        bending_arm_mm=bending_arm_mm,
+    )
+
+
+class RobotParameters(Frozen):
+    """One robot: chassis, two drive wheels, castor fork, castor wheel.
+
+    The centre of mass lies ``com_offset_mm`` behind the axle's midpoint c; the castor's pivot lies
+    ``castor_pivot_mm`` behind c and its floor contact ``castor_trail_mm`` behind the pivot.
+    Fields marked *chosen* are not in the paper.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        (a ValueError) for a value outside its range, an unknown field, or loads that do not fit the
+        place of the centre of mass.
+    """
+
+    # Table I
+    mass_kg: Positive = 1.245
+    wheel_radius_mm: Positive = 50.0
+    axle_width_mm: Positive = 156.0
+    wheel_inertia_kg_mm2: Positive = 52.91
+    gravity_mm_s2: Positive = 9807.0
+    # Section II-B: 0.8 of the weight on the drive wheels, 0.2 on the castor
+    drive_load_share: Annotated[FiniteFloat, Field(gt=0, le=0.5)] = 0.4
+    castor_load_share: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.2
+    # chosen
+    body_inertia_kg_mm2: Positive = 6197.0
+    com_offset_mm: NonNegative = 20.0
+    castor_pivot_mm: Positive = 85.0
+    castor_trail_mm: Positive = 15.0
+    castor_radius_mm: Positive = 20.0
+    castor_inertia_kg_mm2: Positive = 4.0
+    fork_inertia_kg_mm2: Positive = 20.0
+    outline_radius_mm: Positive = 110.0
+    outline_offset_mm: FiniteFloat = 30.0  # centre of the outline's circle, behind c
+    # footnote 4
+    torque_limit_Nmm: Positive = 15.0
+    # Table I; the tyres' v_d is missing there: 1.5 v_s, as for the joints
+    tyre: FrictionCurve = FrictionCurve(
+        mu_static=0.073, mu_dynamic=0.055, stiction_speed_mm_s=2.0, dynamic_speed_mm_s=3.0
+    )
+    drive_joint: JointFriction = _joint(0.15, 0.1, (12.0, 8.0, 36.0))
+    castor_joint: JointFriction = _joint(0.15, 0.1, (6.2, 3.025, 30.0))
+    steering_joint: JointFriction = _joint(0.05, 0.033, (2.5, 2.5, 3.0))
+    joint_friction: bool = True  # False turns eq. (5) off for all joints
+
+    @model_validator(mode="after")
+    def _check_loads(self) -> Self:
+        total = 2 * self.drive_load_share + self.castor_load_share
+        if abs(total - 1) > LOAD_SPLIT_TOLERANCE:
+            raise ValueError(
+                f"2·drive_load_share + castor_load_share is {total}; the three wheels carry 1"
+            )
+        base_mm = self.castor_pivot_mm + self.castor_trail_mm
+        needed_mm = self.castor_load_share * base_mm
+        if abs(needed_mm - self.com_offset_mm) > LOAD_SPLIT_TOLERANCE * base_mm:
+            raise ValueError(
+                f"com_offset_mm {self.com_offset_mm} does not fit castor_load_share "
+                f"{self.castor_load_share}: moments about the axle need castor_load_share·"
+                f"(castor_pivot_mm + castor_trail_mm) = {needed_mm:g}"
+            )
+        return self
+
+
+class Joint(NamedTuple):
+    """Eq. (5) in kernel units, with its constant parts gathered: T_f = μ(v)·(constant + radial + bending).
+
+    ``axial_mm`` multiplies the axial force, ``radial_mm`` the radial one, ``bending`` the bending
+    moment; ``preload`` is in mN·mm.
+    """
+
+    mu_static: float
+    mu_dynamic: float
+    stiction_speed: float
+    dynamic_speed: float
+    axial_mm: float
+    radial_mm: float
+    bending: float
+    preload: float
+
+
+class Body(NamedTuple):
+    """One robot as the kernel reads it: mN, mm, kg, s; inverse masses computed once.
+
+    Names as in ``docs/physics.md``: h half the axle width, d centre of mass behind c, q pivot behind
+    the centre of mass, T trail, subscripts e right, f forward.
+    """
+
+    m: float
+    I: float  # noqa: E741  the symbol of the equations
+    I_s: float
+    J: float
+    J_c: float
+    R: float
+    R_c: float
+    h: float
+    d: float
+    q: float
+    T: float
+    load_drive: float
+    load_castor: float
+    w_ee: float
+    w_ff: float
+    w_ef: float
+    spin_drive: float  # R²/J
+    spin_castor: float  # R_c²/J_c
+    torque_limit: float
+    outline_radius: float
+    outline_ahead: float  # centre of the outline ahead of the centre of mass
+    # tyre
+    mu_static: float
+    mu_dynamic: float
+    stiction_speed: float
+    dynamic_speed: float
+    # eq. (5): drive wheels, castor axle, steering axle
+    drive_mu_static: float
+    drive_mu_dynamic: float
+    drive_stiction_speed: float
+    drive_dynamic_speed: float
+    drive_axial: float
+    drive_radial: float
+    drive_bending: float
+    drive_preload: float
+    axle_mu_static: float
+    axle_mu_dynamic: float
+    axle_stiction_speed: float
+    axle_dynamic_speed: float
+    axle_axial: float
+    axle_radial: float
+    axle_bending: float
+    axle_preload: float
+    steer_mu_static: float
+    steer_mu_dynamic: float
+    steer_stiction_speed: float
+    steer_dynamic_speed: float
+    steer_axial: float
+    steer_radial: float
+    steer_bending: float
+    steer_preload: float
+    steer_pin: float  # R_p of the steering axle: its friction speed is R_p·φ̇
+
+
+def _joint_row(joint: JointFriction, *, enabled: bool) -> Joint:
+    on = 1.0 if enabled else 0.0
+    return Joint(
+        on * joint.mu_static,
+        on * joint.mu_dynamic,
+        joint.stiction_speed_mm_s,
+        joint.dynamic_speed_mm_s,
+        joint.friction_arm_mm,
+        joint.pin_radius_mm,
+        joint.pin_radius_mm / joint.bending_arm_mm if joint.bending else 0.0,
+        joint.preload_Nmm * MILLINEWTON_PER_NEWTON,
+    )
+
+
+def body(p: RobotParameters) -> Body:
+    """Kernel constants of one robot."""
+    half_mm = p.axle_width_mm / 2
+    weight_mN = p.mass_kg * p.gravity_mm_s2
+    inverse_m, inverse_I = 1 / p.mass_kg, 1 / p.body_inertia_kg_mm2
+    return Body(
+        p.mass_kg,
+        p.body_inertia_kg_mm2,
+        p.fork_inertia_kg_mm2,
+        p.wheel_inertia_kg_mm2,
+        p.castor_inertia_kg_mm2,
+        p.wheel_radius_mm,
+        p.castor_radius_mm,
+        half_mm,
+        p.com_offset_mm,
+        p.castor_pivot_mm - p.com_offset_mm,
+        p.castor_trail_mm,
+        p.drive_load_share * weight_mN,
+        p.castor_load_share * weight_mN,
+        inverse_m + p.com_offset_mm**2 * inverse_I,
+        inverse_m + half_mm**2 * inverse_I,
+        p.com_offset_mm * half_mm * inverse_I,
+        p.wheel_radius_mm**2 / p.wheel_inertia_kg_mm2,
+        p.castor_radius_mm**2 / p.castor_inertia_kg_mm2,
+        p.torque_limit_Nmm * MILLINEWTON_PER_NEWTON,
+        p.outline_radius_mm,
+        p.com_offset_mm - p.outline_offset_mm,
+        p.tyre.mu_static,
+        p.tyre.mu_dynamic,
+        p.tyre.stiction_speed_mm_s,
+        p.tyre.dynamic_speed_mm_s,
+        *_joint_row(p.drive_joint, enabled=p.joint_friction),
+        *_joint_row(p.castor_joint, enabled=p.joint_friction),
+        *_joint_row(p.steering_joint, enabled=p.joint_friction),
+        p.steering_joint.pin_radius_mm,
+    )
+
+
+def body_array(robots: list[RobotParameters], lanes: int = 1) -> np.ndarray:
+    """Constants of a formation, ``(field, robot, lane)``, every lane alike."""
+    rows = np.array([body(p) for p in robots], dtype=np.float64)
+    return np.ascontiguousarray(np.repeat(rows.T[:, :, None], lanes, axis=2))

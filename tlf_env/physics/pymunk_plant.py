@@ -1,0 +1,98 @@
+"""The ``pymunk`` plant: one formation in a Chipmunk space, for contact between robots.
+
+The kernel owns centre of mass, angle and velocities, and advances poses exactly as Chipmunk does, so
+Chipmunk need not run while all outlines are well apart: its step would change nothing. While robots
+are close each substep runs through the space, and only robots that a contact has moved are read back.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pymunk
+
+from tlf_env.physics.kernel import Motion
+from tlf_env.physics.parameters import RobotParameters
+
+ITERATIONS = 20
+COLLISION_SLOP_MM = 0.1
+CONTACT_FRICTION = 0.0
+
+X, Y, THETA, V_X, V_Y, YAW = (
+    Motion._fields.index(name) for name in ("x", "y", "theta", "v_x", "v_y", "w")
+)
+
+
+class PymunkPlant:
+    """Bodies of one formation in a :class:`pymunk.Space`; outlines are circles, contact is inelastic."""
+
+    def __init__(self, robots: list[RobotParameters]) -> None:
+        self._robots = robots
+        self._rebuild()
+
+    def _rebuild(self) -> None:
+        space = pymunk.Space()
+        space.iterations = ITERATIONS
+        space.collision_slop = COLLISION_SLOP_MM
+        space.damping = 1.0
+        space.gravity = (0.0, 0.0)
+        self._bodies: list[pymunk.Body] = []
+        for robot in self._robots:
+            body = pymunk.Body(robot.mass_kg, robot.body_inertia_kg_mm2)
+            ahead = robot.com_offset_mm - robot.outline_offset_mm
+            outline = pymunk.Circle(body, robot.outline_radius_mm, offset=(0.0, ahead))
+            outline.friction = CONTACT_FRICTION
+            outline.elasticity = 0.0
+            space.add(body, outline)
+            self._bodies.append(body)
+        space.on_collision(post_solve=self._remember)
+        self._number = {body: i for i, body in enumerate(self._bodies)}
+        self._moved: set[int] = set()
+        self._moved_before: set[int] = set()
+        self._space = space
+
+    def _remember(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:
+        for shape in arbiter.shapes:
+            if shape.body in self._number:
+                self._moved.add(self._number[shape.body])
+
+    def reset(self) -> None:
+        """Forget all contacts: a rebuilt space repeats a run bit for bit."""
+        self._rebuild()
+
+    def space(self, motions: np.ndarray) -> pymunk.Space:
+        """The space with its bodies where ``motions`` (field, robot, 1) has them, for drawing and queries."""
+        self._write(motions, motions)
+        self._space.reindex_shapes()
+        return self._space
+
+    def _write(self, poses: np.ndarray, velocities: np.ndarray) -> None:
+        for i, body in enumerate(self._bodies):
+            body.angle = poses[THETA, i, 0]
+            body.position = poses[X, i, 0], poses[Y, i, 0]
+            body.velocity = velocities[V_X, i, 0], velocities[V_Y, i, 0]
+            body.angular_velocity = velocities[YAW, i, 0]
+
+    def collide(self, before: np.ndarray, motions: np.ndarray, dt: float) -> None:
+        """Run one substep of the space: from the poses ``before`` with the velocities of ``motions``.
+
+        ``motions`` holds the kernel's new velocities and poses; rows of robots that a contact has
+        moved are overwritten with Chipmunk's. Position correction works in the step after a contact
+        was solved, hence the second set.
+        """
+        self._write(before, motions)
+        self._moved_before, self._moved = self._moved, set()
+        self._space.step(dt)
+        for i in self._moved | self._moved_before:
+            body = self._bodies[i]
+            motions[X, i, 0], motions[Y, i, 0] = body.position
+            motions[THETA, i, 0] = body.angle
+            motions[V_X, i, 0], motions[V_Y, i, 0] = body.velocity
+            motions[YAW, i, 0] = body.angular_velocity
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {"robots": self._robots}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__init__(state["robots"])  # type: ignore[misc]

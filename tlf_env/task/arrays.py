@@ -1,0 +1,200 @@
+"""Everything that an episode remembers, as arrays: one quantity a row, formations last."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tlf_env.numerics.compiled import reader, writer
+from tlf_env.onboard.estimator import Ekf, Estimate, ekf_constants
+from tlf_env.onboard.observer import Message, Reference
+from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState, digital_wheel_loop
+from tlf_env.physics.kernel import Contact, Motion
+from tlf_env.physics.parameters import body_array
+from tlf_env.task.disturbance import Effects, constant_effects
+from tlf_env.task.measures import TIME_GAP_WINDOW_S
+from tlf_env.task.observation import tracking_entries
+from tlf_env.task.reward import RewardTerms
+from tlf_env.task.scenario import Scenario
+
+ACTION_SIZE = 2
+
+
+class Sensors(NamedTuple):
+    """Last encoder readings (rad) and the wheel speeds they gave (rad/s)."""
+
+    encoder_l: float
+    encoder_r: float
+    speed_l: float
+    speed_r: float
+
+
+class Trace(NamedTuple):
+    """Sums and extremes over the substeps of one control step."""
+
+    distance: float  # odometry, mm
+    turn: float  # odometry, rad
+    innovation_forward: float  # sums of the EKF's innovation in estimated body axes, mm
+    innovation_right: float
+    nis: float  # sum of the normalised innovation squared
+    torque_l: float  # sums, mN·mm
+    torque_r: float
+    saturated: float  # substeps with a torque at its limit
+    slip: float  # largest slip speed of a drive wheel, mm/s
+
+
+class Info(NamedTuple):
+    """What ``info`` tells of one robot after a step; true values unless said."""
+
+    position_error_mm: float
+    formation_error_mm: float
+    heading_error_rad: float
+    time_gap_error_s: float
+    slip_mm_s: float
+    torque_l_Nmm: float
+    torque_r_Nmm: float
+    saturation_fraction: float
+    innovation_nis: float
+    x_mm: float
+    y_mm: float
+    theta_rad: float
+    reference_x_mm: float
+    reference_y_mm: float
+    reference_theta_rad: float
+    clipped: float
+
+
+class State(NamedTuple):
+    """One robot's true state, for critics that may see it: c, castor, twist, wheels, reference."""
+
+    x_mm: float
+    y_mm: float
+    sin_theta: float
+    cos_theta: float
+    castor_rad: float
+    forward_mm_s: float
+    right_mm_s: float
+    yaw_rad_s: float
+    omega_l_rad_s: float
+    omega_r_rad_s: float
+    reference_x_mm: float
+    reference_y_mm: float
+
+
+class Arrays(NamedTuple):
+    """``(field, robot, lane)`` unless said; a lane is one formation."""
+
+    # constants of an episode
+    bodies: np.ndarray
+    wheel_loops: np.ndarray
+    ekfs: np.ndarray
+    effects: np.ndarray
+    table: np.ndarray  # (step, Reference): the leader's reference at the control steps
+    # physics
+    motions: np.ndarray
+    contacts: np.ndarray
+    # on board, every substep
+    loop_states: np.ndarray
+    sensors: np.ndarray
+    estimates: np.ndarray
+    traces: np.ndarray
+    commands: np.ndarray  # wheel speeds asked for, rad/s
+    # on board, every control step
+    messages: np.ndarray  # (Message, slot, robot, lane): ring over one gap
+    observers: np.ndarray  # (x y θ, robot, lane)
+    references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
+    # truth
+    paths: np.ndarray  # (x y, slot, robot, lane): ring over one gap and the window behind it
+    # time and random numbers
+    clock: np.ndarray  # (lane, 3) int64: substeps, control steps, episode
+    seeds: np.ndarray  # (lane,) int64
+    # interface, formations first
+    actions: np.ndarray  # (lane, robot, 2)
+    last_actions: np.ndarray
+    observations: np.ndarray  # (lane, robot, entry) float32
+    terms: np.ndarray  # (lane, robot, RewardTerms)
+    rewards: np.ndarray  # (lane, robot)
+    infos: np.ndarray  # (lane, robot, Info)
+    lost: np.ndarray  # (lane, robot) bool, in this step
+    touched: np.ndarray  # (lane, robot) bool, in this step
+    scales: np.ndarray  # (entry,)
+    weights: np.ndarray  # (RewardTerms,)
+    previews: np.ndarray  # (preview,) int64, in control steps
+
+
+read_effects = reader(Effects)
+read_sensors = reader(Sensors)
+write_sensors = writer(Sensors)
+read_trace = reader(Trace)
+write_trace = writer(Trace)
+
+
+def _constant(row: tuple[float, ...], robots: int, lanes: int) -> np.ndarray:
+    return np.ascontiguousarray(
+        np.broadcast_to(np.array(row, dtype=np.float64)[:, None, None], (len(row), robots, lanes))
+    )
+
+
+def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays:
+    """Arrays of ``lanes`` formations, not yet reset."""
+    n = scenario.robots
+    gap = scenario.gap_steps
+    window = round(TIME_GAP_WINDOW_S / scenario.control_period_s)
+    lookahead = max(scenario.preview_steps, default=0)
+    entries = len(tracking_entries(scenario.preview_s))
+
+    def zeros(fields: int) -> np.ndarray:
+        return np.zeros((fields, n, lanes))
+
+    return Arrays(
+        bodies=body_array([scenario.robot] * n, lanes),
+        wheel_loops=_constant(
+            digital_wheel_loop(scenario.wheel_loop, scenario.physics_period_s), n, lanes
+        ),
+        ekfs=_constant(ekf_constants(scenario.ekf), n, lanes),
+        effects=_constant(constant_effects(scenario.disturbance), n, lanes),
+        table=table,
+        motions=zeros(len(Motion._fields)),
+        contacts=zeros(len(Contact._fields)),
+        loop_states=zeros(len(WheelLoopState._fields)),
+        sensors=zeros(len(Sensors._fields)),
+        estimates=zeros(len(Estimate._fields)),
+        traces=zeros(len(Trace._fields)),
+        commands=zeros(2),
+        messages=np.zeros((len(Message._fields), gap + 1, n, lanes)),
+        observers=zeros(3),
+        references=np.zeros((len(Reference._fields), lookahead + 1, n, lanes)),
+        paths=np.zeros((2, gap + window + 1, n, lanes)),
+        clock=np.zeros((lanes, 3), dtype=np.int64),
+        seeds=np.zeros(lanes, dtype=np.int64),
+        actions=np.zeros((lanes, n, ACTION_SIZE)),
+        last_actions=np.zeros((lanes, n, ACTION_SIZE)),
+        observations=np.zeros((lanes, n, entries), dtype=np.float32),
+        terms=np.zeros((lanes, n, len(RewardTerms._fields))),
+        rewards=np.zeros((lanes, n)),
+        infos=np.zeros((lanes, n, len(Info._fields))),
+        lost=np.zeros((lanes, n), dtype=np.bool_),
+        touched=np.zeros((lanes, n), dtype=np.bool_),
+        scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
+        weights=np.array([scenario.reward[name] for name in RewardTerms._fields]),
+        previews=np.array(scenario.preview_steps, dtype=np.int64),
+    )
+
+
+__all__ = [
+    "ACTION_SIZE",
+    "Arrays",
+    "Ekf",
+    "Info",
+    "Sensors",
+    "State",
+    "Trace",
+    "WheelLoop",
+    "make_arrays",
+    "read_effects",
+    "read_sensors",
+    "read_trace",
+    "write_sensors",
+    "write_trace",
+]

@@ -1,0 +1,578 @@
+"""The step drivers: the only code that knows both the laws and the arrays.
+
+One control step runs, for every robot and substep, wheel loop → torques → disturbances → plant →
+sensors → EKF, and then once per robot radio → observer → observation, reward, errors. Robots do not
+act on each other within a control step unless they touch, so each runs its substeps by itself; the
+pymunk plant calls :func:`actuate` and :func:`sense` one substep at a time while robots are close.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tlf_env.numerics.angles import wrap
+from tlf_env.numerics.compiled import block, driver, law
+from tlf_env.numerics.philox import normal_pair
+from tlf_env.onboard.estimator import (
+    Ekf,
+    Estimate,
+    correct,
+    odometry,
+    predict,
+    read_ekf,
+    read_estimate,
+    write_estimate,
+)
+from tlf_env.onboard.observer import Message, Reference, observed_reference, observer_rates, smoothing
+from tlf_env.onboard.tracking import body_errors
+from tlf_env.onboard.wheel_loop import (
+    WheelLoop,
+    WheelLoopState,
+    read_loop_state,
+    read_wheel_loop,
+    wheel_torque,
+    write_loop_state,
+)
+from tlf_env.physics.kernel import (
+    Contact,
+    Floor,
+    Motion,
+    Push,
+    advance_pose,
+    axle_midpoint,
+    conveyor,
+    read_body,
+    read_contact,
+    read_motion,
+    substep,
+    write_contact,
+    write_motion,
+)
+from tlf_env.physics.kinematics import follow_wheels
+from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Body
+from tlf_env.task.arrays import (
+    Arrays,
+    Info,
+    Sensors,
+    Trace,
+    read_effects,
+    read_sensors,
+    read_trace,
+    write_sensors,
+    write_trace,
+)
+from tlf_env.task.channels import POSITION_NOISE
+from tlf_env.task.disturbance import Effects
+from tlf_env.task.measures import TIME_GAP_WINDOW_S, distance, time_gap_error
+from tlf_env.task.observation import Tracking, preview_entries, scaled
+from tlf_env.task.reward import reward_terms
+
+TWIST, WHEEL_SPEED = 0, 1
+FULL_SPEED_MM_S = 1000.0
+FULL_YAW_RATE_RAD_S = 8.0
+FULL_WHEEL_SPEED_RAD_S = 25.0
+
+NO_PUSH = Push(0.0, 0.0, 0.0)
+
+
+@law
+def wheel_command(a_0: float, a_1: float, kind: int, body: Body) -> tuple[float, float]:
+    """Wheel speeds (left, right; rad/s) that an action in [−1, 1]² asks for; the inverse of eq. (1)."""
+    if kind == WHEEL_SPEED:
+        return a_0 * FULL_WHEEL_SPEED_RAD_S, a_1 * FULL_WHEEL_SPEED_RAD_S
+    forward = a_0 * FULL_SPEED_MM_S
+    turn = a_1 * FULL_YAW_RATE_RAD_S * body.h
+    return (forward - turn) / body.R, (forward + turn) / body.R
+
+
+@law
+def actuate_robot(
+    body: Body,
+    loop: WheelLoop,
+    effects: Effects,
+    motion: Motion,
+    contact: Contact,
+    held: WheelLoopState,
+    sensors: Sensors,
+    trace: Trace,
+    wanted_l: float,
+    wanted_r: float,
+    kinematic: bool,
+    dt: float,
+) -> tuple[Motion, Contact, WheelLoopState, Trace]:
+    """Wheel loop, torques, disturbances and plant for one substep of one robot."""
+    if kinematic:
+        moved = follow_wheels(body, motion, wanted_l, wanted_r, effects.delta_1, effects.delta_2, dt)
+        return moved, contact, held, trace
+    limit = body.torque_limit
+    torque_l, integral_l, lag_l = wheel_torque(
+        wanted_l - sensors.speed_l, held.integral_l, held.lag_l, loop, limit
+    )
+    torque_r, integral_r, lag_r = wheel_torque(
+        wanted_r - sensors.speed_r, held.integral_r, held.lag_r, loop, limit
+    )
+    belt_l, belt_r = conveyor(effects.delta_1, effects.delta_2, body.h)
+    floor = Floor(belt_l, belt_r, effects.grip, effects.grip, effects.grip)
+    motion, contact = substep(body, motion, contact, floor, NO_PUSH, torque_l, torque_r, dt)
+    at_limit = abs(torque_l) >= limit or abs(torque_r) >= limit
+    return (
+        advance_pose(motion, dt),
+        contact,
+        WheelLoopState(integral_l, lag_l, integral_r, lag_r),
+        Trace(
+            trace.distance,
+            trace.turn,
+            trace.innovation_forward,
+            trace.innovation_right,
+            trace.nis,
+            trace.torque_l + torque_l,
+            trace.torque_r + torque_r,
+            trace.saturated + (1.0 if at_limit else 0.0),
+            max(trace.slip, max(contact.slip_l, contact.slip_r)),
+        ),
+    )
+
+
+@law
+def sense_robot(
+    body: Body,
+    ekf: Ekf,
+    effects: Effects,
+    motion: Motion,
+    sensors: Sensors,
+    estimate: Estimate,
+    trace: Trace,
+    seed: int,
+    episode: int,
+    robot: int,
+    tick: int,
+    dt: float,
+) -> tuple[Sensors, Estimate, Trace]:
+    """Encoders, position fix and EKF after substep ``tick`` of one robot."""
+    step_l, step_r = motion.angle_l - sensors.encoder_l, motion.angle_r - sensors.encoder_r
+    u_1, u_2 = odometry(step_l, step_r, body.R, body.h)
+    x, y = axle_midpoint(motion, body.d)
+    if effects.fix_std > 0.0:
+        noise_x, noise_y = normal_pair(seed, POSITION_NOISE, robot, episode, tick)
+        x += effects.fix_std * noise_x
+        y += effects.fix_std * noise_y
+    estimate, d_x, d_y, nis = correct(predict(estimate, ekf, u_1, u_2), ekf, x, y)
+    forward, right = body_errors(d_x, d_y, estimate.theta)
+    return (
+        Sensors(motion.angle_l, motion.angle_r, step_l / dt, step_r / dt),
+        estimate,
+        Trace(
+            trace.distance + u_1,
+            trace.turn + u_2,
+            trace.innovation_forward + forward,
+            trace.innovation_right + right,
+            trace.nis + nis,
+            trace.torque_l,
+            trace.torque_r,
+            trace.saturated,
+            trace.slip,
+        ),
+    )
+
+
+@driver
+def take_actions(a: Arrays, kind: int) -> int:
+    """Clip the actions and turn them into commands; clears the traces.
+
+    Returns −1, or lane · robots + robot of the first action that is not finite; then nothing changes.
+    """
+    lanes, robots = a.actions.shape[0], a.actions.shape[1]
+    for lane in range(lanes):
+        for r in range(robots):
+            if not (np.isfinite(a.actions[lane, r, 0]) and np.isfinite(a.actions[lane, r, 1])):
+                return lane * robots + r
+    for lane in range(lanes):
+        for r in range(robots):
+            a_0 = min(max(a.actions[lane, r, 0], -1.0), 1.0)
+            a_1 = min(max(a.actions[lane, r, 1], -1.0), 1.0)
+            clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]
+            if clipped:
+                a.infos[lane, r, CLIPPED] += 1.0
+            a.actions[lane, r, 0], a.actions[lane, r, 1] = a_0, a_1
+            body = read_body(a.bodies, r, lane)
+            a.commands[0, r, lane], a.commands[1, r, lane] = wheel_command(a_0, a_1, kind, body)
+            a.touched[lane, r] = False
+    a.traces[:] = 0.0
+    return -1
+
+
+@driver
+def advance(a: Arrays, kinematic: bool, substeps: int, dt: float) -> None:
+    """Run ``substeps`` substeps of every robot, each by itself."""
+    for lane in range(a.clock.shape[0]):
+        seed, episode, first = a.seeds[lane], a.clock[lane, 2], a.clock[lane, 0]
+        for r in range(a.motions.shape[1]):
+            body = read_body(a.bodies, r, lane)
+            loop = read_wheel_loop(a.wheel_loops, r, lane)
+            ekf = read_ekf(a.ekfs, r, lane)
+            effects = read_effects(a.effects, r, lane)
+            motion = read_motion(a.motions, r, lane)
+            contact = read_contact(a.contacts, r, lane)
+            held = read_loop_state(a.loop_states, r, lane)
+            sensors = read_sensors(a.sensors, r, lane)
+            estimate = read_estimate(a.estimates, r, lane)
+            trace = read_trace(a.traces, r, lane)
+            wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
+            for k in range(substeps):
+                motion, contact, held, trace = actuate_robot(
+                    body,
+                    loop,
+                    effects,
+                    motion,
+                    contact,
+                    held,
+                    sensors,
+                    trace,
+                    wanted_l,
+                    wanted_r,
+                    kinematic,
+                    dt,
+                )
+                sensors, estimate, trace = sense_robot(
+                    body,
+                    ekf,
+                    effects,
+                    motion,
+                    sensors,
+                    estimate,
+                    trace,
+                    seed,
+                    episode,
+                    r,
+                    first + k + 1,
+                    dt,
+                )
+            write_motion(a.motions, r, lane, motion)
+            write_contact(a.contacts, r, lane, contact)
+            write_loop_state(a.loop_states, r, lane, held)
+            write_sensors(a.sensors, r, lane, sensors)
+            write_estimate(a.estimates, r, lane, estimate)
+            write_trace(a.traces, r, lane, trace)
+        a.clock[lane, 0] = first + substeps
+
+
+@driver
+def actuate(a: Arrays, kinematic: bool, dt: float) -> None:
+    """The first half of one substep of lane 0: everything up to the plant's new velocities and poses."""
+    for r in range(a.motions.shape[1]):
+        motion, contact, held, trace = actuate_robot(
+            read_body(a.bodies, r, 0),
+            read_wheel_loop(a.wheel_loops, r, 0),
+            read_effects(a.effects, r, 0),
+            read_motion(a.motions, r, 0),
+            read_contact(a.contacts, r, 0),
+            read_loop_state(a.loop_states, r, 0),
+            read_sensors(a.sensors, r, 0),
+            read_trace(a.traces, r, 0),
+            a.commands[0, r, 0],
+            a.commands[1, r, 0],
+            kinematic,
+            dt,
+        )
+        write_motion(a.motions, r, 0, motion)
+        write_contact(a.contacts, r, 0, contact)
+        write_loop_state(a.loop_states, r, 0, held)
+        write_trace(a.traces, r, 0, trace)
+
+
+@driver
+def sense(a: Arrays, dt: float) -> None:
+    """The second half of one substep of lane 0: sensors and EKF, and which outlines meet."""
+    tick = a.clock[0, 0] + 1
+    for r in range(a.motions.shape[1]):
+        sensors, estimate, trace = sense_robot(
+            read_body(a.bodies, r, 0),
+            read_ekf(a.ekfs, r, 0),
+            read_effects(a.effects, r, 0),
+            read_motion(a.motions, r, 0),
+            read_sensors(a.sensors, r, 0),
+            read_estimate(a.estimates, r, 0),
+            read_trace(a.traces, r, 0),
+            a.seeds[0],
+            a.clock[0, 2],
+            r,
+            tick,
+            dt,
+        )
+        write_sensors(a.sensors, r, 0, sensors)
+        write_estimate(a.estimates, r, 0, estimate)
+        write_trace(a.traces, r, 0, trace)
+    a.clock[0, 0] = tick
+
+
+@law
+def wanted_of_formation(a: Arrays, lane: int, r: int, step: int, gap: int) -> tuple[float, float]:
+    """Where robot ``r`` belongs by the leader's reference, ref(t − r·gap), at rest before it starts; mm."""
+    k = max(step - r * gap, 0)
+    return a.table[k, 0], a.table[k, 1]
+
+
+@block
+def next_reference(
+    a: Arrays, lane: int, r: int, m: int, gap: int, gain: float, smoothing_s: float, period: float
+) -> None:
+    """Put the reference of control step ``m`` into the ring and move the follower's observer on."""
+    slot = m % a.references.shape[1]
+    if r == 0:
+        for i in range(5):
+            a.references[i, slot, r, lane] = a.table[m, i]
+        return
+    old = max(m - gap, 0) % a.messages.shape[1]
+    delayed = Message(
+        a.messages[0, old, r - 1, lane],
+        a.messages[1, old, r - 1, lane],
+        a.messages[2, old, r - 1, lane],
+        a.messages[3, old, r - 1, lane],
+        a.messages[4, old, r - 1, lane],
+    )
+    x, y = a.observers[0, r, lane], a.observers[1, r, lane]
+    theta = a.observers[2, r, lane]
+    factor = smoothing(m * period, smoothing_s)
+    rate_x, rate_y, rate_theta = observer_rates(x, y, theta, delayed, gain, factor)
+    reference = observed_reference(x, y, theta, rate_x, rate_y, rate_theta)
+    for i in range(5):
+        a.references[i, slot, r, lane] = reference[i]
+    a.observers[0, r, lane] = x + period * rate_x
+    a.observers[1, r, lane] = y + period * rate_y
+    a.observers[2, r, lane] = theta + period * rate_theta
+
+
+@law
+def read_reference(a: Arrays, lane: int, r: int, m: int) -> Reference:
+    """The reference of control step ``m``, from the ring."""
+    slot = m % a.references.shape[1]
+    return Reference(
+        a.references[0, slot, r, lane],
+        a.references[1, slot, r, lane],
+        a.references[2, slot, r, lane],
+        a.references[3, slot, r, lane],
+        a.references[4, slot, r, lane],
+    )
+
+
+@block
+def record_truth(a: Arrays, lane: int, r: int, step: int) -> None:
+    """Put the true place of robot ``r`` into the ring of paths."""
+    slot = step % a.paths.shape[1]
+    x, y = axle_midpoint(read_motion(a.motions, r, lane), a.bodies[BODY_D, r, lane])
+    a.paths[0, slot, r, lane], a.paths[1, slot, r, lane] = x, y
+
+
+@block
+def broadcast(a: Arrays, lane: int, r: int, step: int, period: float) -> None:
+    """Put robot ``r``'s estimated pose and odometry twist on the air."""
+    slot = step % a.messages.shape[1]
+    trace = read_trace(a.traces, r, lane)
+    for i in range(3):
+        a.messages[i, slot, r, lane] = a.estimates[i, r, lane]
+    a.messages[3, slot, r, lane] = trace.distance / period
+    a.messages[4, slot, r, lane] = trace.turn / period
+
+
+@block
+def observe_robot(a: Arrays, lane: int, r: int, step: int, substeps: int, period: float) -> None:
+    """Write the ``tracking`` observation of one robot."""
+    robots = a.motions.shape[1]
+    estimate = read_estimate(a.estimates, r, lane)
+    reference = read_reference(a, lane, r, step)
+    trace = read_trace(a.traces, r, lane)
+    e_1, e_2 = body_errors(
+        reference.x - estimate.x, reference.y - estimate.y, estimate.theta
+    )
+    e_3 = reference.theta - estimate.theta
+    sin_e3, cos_e3 = math.sin(e_3), math.cos(e_3)
+    per_substep = 1.0 / substeps
+    to_Nmm = per_substep / MILLINEWTON_PER_NEWTON
+    row = Tracking(
+        e_1,
+        e_2,
+        sin_e3,
+        cos_e3,
+        e_1,
+        e_2,
+        sin_e3,
+        reference.u_1,
+        reference.u_2,
+        trace.distance / period,
+        trace.turn / period,
+        a.last_actions[lane, r, 0],
+        a.last_actions[lane, r, 1],
+        trace.innovation_forward * per_substep,
+        trace.innovation_right * per_substep,
+        0.0,
+        0.0,
+        trace.torque_l * to_Nmm,
+        trace.torque_r * to_Nmm,
+        1.0 if r == 0 else 0.0,
+        1.0 if r == robots - 1 else 0.0,
+    )
+    entries = len(row)
+    for i in range(entries):
+        a.observations[lane, r, i] = scaled(row[i], a.scales[i])
+    for p in range(a.previews.shape[0]):
+        later = read_reference(a, lane, r, step + a.previews[p])
+        preview = preview_entries(later, estimate.x, estimate.y, estimate.theta)
+        for i in range(len(preview)):
+            j = entries + p * len(preview) + i
+            a.observations[lane, r, j] = scaled(preview[i], a.scales[j])
+
+
+@block
+def judge_robot(
+    a: Arrays, lane: int, r: int, step: int, gap: int, substeps: int, period: float, lost_beyond: float
+) -> None:
+    """Write the true errors, the reward terms and whether one robot is lost."""
+    motion = read_motion(a.motions, r, lane)
+    d = a.bodies[BODY_D, r, lane]
+    x, y = axle_midpoint(motion, d)
+    reference = read_reference(a, lane, r, step)
+    trace = read_trace(a.traces, r, lane)
+    error = distance(x, y, reference.x, reference.y)
+    wanted_x, wanted_y = wanted_of_formation(a, lane, r, step, gap)
+    late = 0.0
+    if r > 0:
+        window = int(round(TIME_GAP_WINDOW_S / period))
+        late = time_gap_error(x, y, a.paths[:, :, r - 1, lane], step, gap, window, period)
+    to_Nmm = 1.0 / (substeps * MILLINEWTON_PER_NEWTON)
+    info = Info(
+        error,
+        distance(x, y, wanted_x, wanted_y),
+        wrap(reference.theta - motion.theta),
+        late,
+        trace.slip,
+        trace.torque_l * to_Nmm,
+        trace.torque_r * to_Nmm,
+        trace.saturated / substeps,
+        trace.nis / substeps,
+        x,
+        y,
+        motion.theta,
+        reference.x,
+        reference.y,
+        reference.theta,
+        a.infos[lane, r, CLIPPED],
+    )
+    for i in range(len(info)):
+        a.infos[lane, r, i] = info[i]
+
+    a.lost[lane, r] = error > lost_beyond
+    size = change = 0.0
+    for i in range(a.actions.shape[2]):
+        size += a.actions[lane, r, i] ** 2
+        change += (a.actions[lane, r, i] - a.last_actions[lane, r, i]) ** 2
+        a.last_actions[lane, r, i] = a.actions[lane, r, i]
+    terms = reward_terms(error, change, size, trace.slip, a.lost[lane, r], a.touched[lane, r])
+    total = 0.0
+    for i in range(len(terms)):
+        a.terms[lane, r, i] = terms[i]
+        total += a.weights[i] * terms[i]
+    a.rewards[lane, r] = total
+
+
+@driver
+def begin(
+    a: Arrays, lane: int, gap: int, lookahead: int, gain: float, smoothing_s: float, period: float
+) -> None:
+    """After the poses of a lane are set: first message, references up to the preview, first paths."""
+    robots = a.motions.shape[1]
+    for r in range(robots):
+        broadcast(a, lane, r, 0, period)
+        record_truth(a, lane, r, 0)
+    for r in range(robots):
+        for m in range(lookahead + 1):
+            next_reference(a, lane, r, m, gap, gain, smoothing_s, period)
+
+
+@driver
+def conclude(
+    a: Arrays,
+    gap: int,
+    lookahead: int,
+    substeps: int,
+    gain: float,
+    smoothing_s: float,
+    period: float,
+    lost_beyond: float,
+) -> None:
+    """After the substeps of a control step: radio, observers, errors, rewards and observations."""
+    robots = a.motions.shape[1]
+    for lane in range(a.clock.shape[0]):
+        step = a.clock[lane, 1] + 1
+        a.clock[lane, 1] = step
+        for r in range(robots):
+            broadcast(a, lane, r, step, period)
+            record_truth(a, lane, r, step)
+        for r in range(robots):
+            next_reference(a, lane, r, step + lookahead, gap, gain, smoothing_s, period)
+            judge_robot(a, lane, r, step, gap, substeps, period, lost_beyond)
+            observe_robot(a, lane, r, step, substeps, period)
+
+
+@driver
+def observe(a: Arrays, lane: int, gap: int, substeps: int, period: float, lost_beyond: float) -> None:
+    """Errors and observations of a lane as it stands, for the first observation of an episode."""
+    for r in range(a.motions.shape[1]):
+        judge_robot(a, lane, r, a.clock[lane, 1], gap, substeps, period, lost_beyond)
+        observe_robot(a, lane, r, a.clock[lane, 1], substeps, period)
+        a.infos[lane, r, CLIPPED] = 0.0
+
+
+@law
+def outline_centre(a: Arrays, lane: int, r: int) -> tuple[float, float]:
+    """Centre of the outline's circle, mm."""
+    motion = read_motion(a.motions, r, lane)
+    ahead = a.bodies[BODY_AHEAD, r, lane]
+    return motion.x - ahead * math.sin(motion.theta), motion.y + ahead * math.cos(motion.theta)
+
+
+@driver
+def room_to_move(a: Arrays, lane: int, duration: float, change: float, margin: float) -> bool:
+    """Whether no two outlines (circles) can come within ``margin`` mm during ``duration`` s.
+
+    ``change`` (mm/s²) bounds what the floor can do to a robot's speed meanwhile.
+    """
+    robots = a.motions.shape[1]
+    for i in range(robots):
+        x_i, y_i = outline_centre(a, lane, i)
+        speed_i = outline_speed(a, lane, i)
+        for j in range(i):
+            x_j, y_j = outline_centre(a, lane, j)
+            room = a.bodies[BODY_OUTLINE, i, lane] + a.bodies[BODY_OUTLINE, j, lane]
+            closing = speed_i + outline_speed(a, lane, j) + 2.0 * change * duration
+            if distance(x_i, y_i, x_j, y_j) - room <= margin + closing * duration:
+                return False
+    return True
+
+
+@law
+def outline_speed(a: Arrays, lane: int, r: int) -> float:
+    """A bound on the speed of the outline's centre, mm/s."""
+    motion = read_motion(a.motions, r, lane)
+    swing = abs(motion.w * a.bodies[BODY_AHEAD, r, lane])
+    return math.sqrt(motion.v_x * motion.v_x + motion.v_y * motion.v_y) + swing
+
+
+@driver
+def mark_touched(a: Arrays, lane: int) -> None:
+    """Set ``touched`` for robots whose outlines meet."""
+    robots = a.motions.shape[1]
+    for i in range(robots):
+        x_i, y_i = outline_centre(a, lane, i)
+        for j in range(i):
+            x_j, y_j = outline_centre(a, lane, j)
+            room = a.bodies[BODY_OUTLINE, i, lane] + a.bodies[BODY_OUTLINE, j, lane]
+            if distance(x_i, y_i, x_j, y_j) <= room:
+                a.touched[lane, i] = a.touched[lane, j] = True
+
+
+CLIPPED = Info._fields.index("clipped")
+BODY_D = Body._fields.index("d")
+BODY_OUTLINE = Body._fields.index("outline_radius")
+BODY_AHEAD = Body._fields.index("outline_ahead")

@@ -1,0 +1,66 @@
+"""True errors of one robot, measured and not commanded."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from tlf_env.numerics.compiled import law
+
+TIME_GAP_WINDOW_S = 2.0
+
+
+@law
+def distance(x_a: float, y_a: float, x_b: float, y_b: float) -> float:
+    """Distance of two points, mm."""
+    return math.sqrt((x_a - x_b) ** 2 + (y_a - y_b) ** 2)
+
+
+@law
+def nearest_on_segment(
+    x: float, y: float, x_a: float, y_a: float, x_b: float, y_b: float
+) -> tuple[float, float]:
+    """Fraction along the segment a–b of its point nearest to (x, y), and the squared distance to it."""
+    d_x, d_y = x_b - x_a, y_b - y_a
+    length_2 = d_x * d_x + d_y * d_y
+    along = (x - x_a) * d_x + (y - y_a) * d_y
+    fraction = min(max(along / length_2, 0.0), 1.0) if length_2 > 0.0 else 0.0
+    r_x, r_y = x_a + fraction * d_x - x, y_a + fraction * d_y - y
+    return fraction, r_x * r_x + r_y * r_y
+
+
+@law
+def time_gap_error(
+    x: float,
+    y: float,
+    path: np.ndarray,
+    step: int,
+    gap_steps: int,
+    window_steps: int,
+    period_s: float,
+) -> float:
+    """How much later than one gap ago the predecessor passed where the follower is now, s.
+
+    ``path[axis, slot]`` is a ring of the predecessor's true positions, one per control step; the
+    nearest point of it within ±``window_steps`` of one gap ago is taken. Positive: the follower is
+    late. 0 while the predecessor has no past of one gap.
+    """
+    if step < gap_steps:
+        return 0.0
+    slots = path.shape[1]
+    first = max(step - gap_steps - window_steps, 0)
+    last = min(step - gap_steps + window_steps, step)
+    best, best_step = math.inf, 0.0
+    a = first % slots
+    for k in range(first, last):
+        b = a + 1 if a + 1 < slots else 0
+        fraction, squared = nearest_on_segment(
+            x, y, path[0, a], path[1, a], path[0, b], path[1, b]
+        )
+        if squared < best:
+            best, best_step = squared, k + fraction
+        a = b
+    if math.isinf(best):
+        return 0.0
+    return (step - best_step - gap_steps) * period_s

@@ -1,0 +1,119 @@
+"""What a policy sees: the ``tracking`` observation, entry by entry, and how it is scaled."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from tlf_env.numerics.angles import wrap
+from tlf_env.numerics.compiled import law
+from tlf_env.onboard.observer import Reference
+from tlf_env.onboard.tracking import body_errors
+
+OBSERVATION_LIMIT = 10.0
+
+
+class Entry(NamedTuple):
+    """One entry of an observation: what it means, its unit, and the value that is scaled to 1."""
+
+    meaning: str
+    unit: str
+    scale: float
+
+
+class Tracking(NamedTuple):
+    """Entries of the ``tracking`` observation, in physical units, before scaling."""
+
+    e_1: float
+    e_2: float
+    sin_e_3: float
+    cos_e_3: float
+    e_1_fine: float
+    e_2_fine: float
+    sin_e_3_fine: float
+    reference_u_1: float
+    reference_u_2: float
+    odometry_u_1: float
+    odometry_u_2: float
+    last_action_0: float
+    last_action_1: float
+    innovation_forward: float
+    innovation_right: float
+    slip_1: float
+    slip_2: float
+    torque_l: float
+    torque_r: float
+    is_leader: float
+    is_last: float
+
+
+TRACKING_ENTRIES = {
+    "e_1": Entry("position error forward, e₁ of eq. (16), from the estimated pose", "mm", 500.0),
+    "e_2": Entry("position error to the right, e₂", "mm", 500.0),
+    "sin_e_3": Entry("sine of the heading error e₃", "1", 1.0),
+    "cos_e_3": Entry("cosine of the heading error e₃", "1", 1.0),
+    "e_1_fine": Entry("e₁ again, fine", "mm", 10.0),
+    "e_2_fine": Entry("e₂ again, fine", "mm", 10.0),
+    "sin_e_3_fine": Entry("sine of e₃ again, fine", "1", 0.1),
+    "reference_u_1": Entry("speed of the reference, u₁*", "mm/s", 500.0),
+    "reference_u_2": Entry("yaw rate of the reference, u₂*", "rad/s", 2.0),
+    "odometry_u_1": Entry("speed by the wheels, mean over the last step", "mm/s", 500.0),
+    "odometry_u_2": Entry("yaw rate by the wheels, mean over the last step", "rad/s", 2.0),
+    "last_action_0": Entry("last action, first component", "1", 1.0),
+    "last_action_1": Entry("last action, second component", "1", 1.0),
+    "innovation_forward": Entry("EKF innovation forward, mean over the last step", "mm", 1.0),
+    "innovation_right": Entry("EKF innovation to the right, mean over the last step", "mm", 1.0),
+    "slip_1": Entry("estimate of the slip δ₁; 0 with the paper's EKF", "mm/s", 100.0),
+    "slip_2": Entry("estimate of the slip δ₂; 0 with the paper's EKF", "rad/s", 1.0),
+    "torque_l": Entry("torque of the left wheel, mean over the last step", "N·mm", 15.0),
+    "torque_r": Entry("torque of the right wheel, mean over the last step", "N·mm", 15.0),
+    "is_leader": Entry("1 for the leader (robot_0)", "1", 1.0),
+    "is_last": Entry("1 for the last robot of the formation", "1", 1.0),
+}
+
+
+class Preview(NamedTuple):
+    """Entries that repeat for each preview time."""
+
+    forward: float
+    right: float
+    sin_turn: float
+    cos_turn: float
+    u_1: float
+    u_2: float
+
+
+PREVIEW_ENTRIES = {
+    "forward": Entry("place of the later reference, forward of the estimated pose", "mm", 500.0),
+    "right": Entry("place of the later reference, to the right of the estimated pose", "mm", 500.0),
+    "sin_turn": Entry("sine of its heading minus the estimated heading", "1", 1.0),
+    "cos_turn": Entry("cosine of its heading minus the estimated heading", "1", 1.0),
+    "u_1": Entry("its speed u₁*", "mm/s", 500.0),
+    "u_2": Entry("its yaw rate u₂*", "rad/s", 2.0),
+}
+
+
+def tracking_entries(preview_s: tuple[float, ...]) -> dict[str, Entry]:
+    """All entries by name, in order; the previews' names carry their time: ``forward_in_0.5_s``."""
+    later = {
+        f"{name}_in_{time_s:g}_s": entry
+        for time_s in preview_s
+        for name, entry in PREVIEW_ENTRIES.items()
+    }
+    return TRACKING_ENTRIES | later
+
+
+@law
+def scaled(value: float, scale: float) -> float:
+    """An entry in its scale, clipped at ±10."""
+    return min(max(value / scale, -OBSERVATION_LIMIT), OBSERVATION_LIMIT)
+
+
+@law
+def preview_entries(later: Reference, x: float, y: float, theta: float) -> Preview:
+    """A later reference as seen from an estimated pose."""
+    forward, right = body_errors(later.x - x, later.y - y, theta)
+    turn = wrap(later.theta - theta)
+    return Preview(forward, right, math.sin(turn), math.cos(turn), later.u_1, later.u_2)

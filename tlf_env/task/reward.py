@@ -1,0 +1,43 @@
+"""The named terms of the reward; each is logged, and each has a weight of its own."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from tlf_env.numerics.compiled import law
+
+SLIP_UNIT_MM_S = 100.0
+
+
+class RewardTerms(NamedTuple):
+    """Unweighted terms of one robot and one step."""
+
+    coarse: float  # e^(−e/100 mm), e the true position error to the robot's own reference
+    medium: float  # e^(−e/10 mm)
+    fine: float  # e^(−e/2 mm)
+    action_change: float  # |Δa|², a in units of the action space
+    action_size: float  # |a|²
+    slip: float  # largest slip speed of a drive wheel in the step, in units of 100 mm/s
+    lost: float  # 1 in the step in which the robot is lost
+    touched: float  # 1 in the step in which it touches another
+
+
+DEFAULT_WEIGHTS = RewardTerms(0.5, 0.5, 0.5, -0.02, -0.005, -0.05, -20.0, -20.0)
+
+
+@law
+def reward_terms(
+    error: float, change: float, size: float, slip: float, lost: bool, touched: bool
+) -> RewardTerms:
+    """The terms for a position error in mm, |Δa|², |a|², and a slip speed in mm/s."""
+    return RewardTerms(
+        math.exp(-error / 100.0),
+        math.exp(-error / 10.0),
+        math.exp(-error / 2.0),
+        change,
+        size,
+        slip / SLIP_UNIT_MM_S,
+        1.0 if lost else 0.0,
+        1.0 if touched else 0.0,
+    )

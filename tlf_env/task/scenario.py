@@ -1,0 +1,250 @@
+"""The scenario: one frozen, validated model of everything that an episode depends on but its seed."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+import yaml
+from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
+
+from tlf_env.numerics.errors import one_line
+from tlf_env.onboard.estimator import EkfParameters
+from tlf_env.onboard.observer import ObserverParameters
+from tlf_env.onboard.wheel_loop import WheelLoopParameters
+from tlf_env.physics.parameters import Frozen, NonNegative, Positive, RobotParameters
+from tlf_env.task.disturbance import Disturbance, constant_effects
+from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
+from tlf_env.task.trajectories import Trajectory
+
+PACKAGE = Path(__file__).resolve().parent.parent
+MAX_ROBOTS = 1000
+SETTLE_FRACTION = 0.4
+DIVIDES_TOLERANCE = 1e-9
+MAX_STEPS = 10_000_000
+
+EndReason = Literal["lost", "touched"]
+
+
+def presets_folder() -> Path:
+    """Where the presets lie: inside the installed package, or at the top of a source checkout."""
+    installed = PACKAGE / "configs"
+    return installed if installed.is_dir() else PACKAGE.parent / "configs"
+
+
+def preset_names(folder: Path | None = None) -> list[str]:
+    """Names of the presets in a folder of configs, by default the scenarios."""
+    return sorted(path.stem for path in (folder or presets_folder()).glob("*.yaml"))
+
+
+def read_yaml(path: Path) -> dict[str, Any]:
+    """A YAML file as a mapping.
+
+    Raises
+    ------
+    ValueError
+        in one line, if the file is missing, is not YAML, or is not a mapping.
+    """
+    try:
+        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+    except (yaml.YAMLError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{path} must hold a mapping, got {type(data).__name__}")
+    return data
+
+
+def _disturbance_preset(name: str) -> dict[str, Any]:
+    folder = presets_folder() / "disturbances"
+    if name not in preset_names(folder):
+        raise ValueError(
+            f"disturbance {name!r} is not one of {', '.join(preset_names(folder))}, nor a mapping"
+        )
+    return {"name": name, **read_yaml(folder / f"{name}.yaml")}
+
+
+def whole_steps(duration_s: float, period_s: float) -> int | None:
+    """How many periods a duration is, or None if that is no whole number."""
+    steps = round(duration_s / period_s)
+    return steps if abs(steps * period_s - duration_s) <= DIVIDES_TOLERANCE * duration_s else None
+
+
+class Scenario(Frozen):
+    """Task, robots, onboard stack, disturbance, interface and end of an episode. Times in s."""
+
+    name: str = "custom"
+    trajectory: Trajectory
+    robots: Annotated[int, Field(ge=1, le=MAX_ROBOTS)] = 3
+    robot: RobotParameters = RobotParameters()
+    time_gap_s: Positive = 5.0
+    start_spacing_mm: Positive = 300.0
+
+    physics_period_s: Positive = 0.001
+    control_period_s: Positive = 0.02
+    horizon_s: Positive = 100.0
+    plant: Literal["pymunk", "kinematic"] = "pymunk"
+
+    wheel_loop: WheelLoopParameters = WheelLoopParameters()
+    estimator: Literal["ekf"] = "ekf"
+    ekf: EkfParameters = EkfParameters()
+    observer: ObserverParameters = ObserverParameters()
+
+    disturbance: Disturbance = Disturbance()
+
+    action: Literal["twist", "wheel_speed"] = "twist"
+    observation: Literal["tracking"] = "tracking"
+    preview_s: tuple[NonNegative, ...] = (0.5, 1.0)
+    reward: dict[str, FiniteFloat] = Field(default_factory=DEFAULT_WEIGHTS._asdict)
+    end_on: tuple[EndReason, ...] = ("lost", "touched")
+    lost_beyond_mm: Positive = 1200.0
+
+    @field_validator("disturbance", mode="before")
+    @classmethod
+    def _named_disturbance(cls, value: Any) -> Any:
+        return _disturbance_preset(value) if isinstance(value, str) else value
+
+    @field_validator("reward", mode="before")
+    @classmethod
+    def _complete_weights(cls, value: Any) -> Any:
+        if not isinstance(value, Mapping):
+            return value
+        unknown = sorted(set(value) - set(RewardTerms._fields))
+        if unknown:
+            raise ValueError(
+                f"unknown term {unknown[0]!r}; the terms are {', '.join(RewardTerms._fields)}"
+            )
+        return {**DEFAULT_WEIGHTS._asdict(), **value}
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        for name in ("control_period_s",):
+            if whole_steps(getattr(self, name), self.physics_period_s) in (None, 0):
+                raise ValueError(
+                    f"{name} {getattr(self, name)} must be a multiple of physics_period_s "
+                    f"{self.physics_period_s}"
+                )
+        for name in ("time_gap_s", "horizon_s"):
+            if whole_steps(getattr(self, name), self.control_period_s) in (None, 0):
+                raise ValueError(
+                    f"{name} {getattr(self, name)} must be a multiple of control_period_s "
+                    f"{self.control_period_s}"
+                )
+        for time_s in self.preview_s:
+            if time_s and whole_steps(time_s, self.control_period_s) is None:
+                raise ValueError(
+                    f"preview_s {time_s} must be a multiple of control_period_s "
+                    f"{self.control_period_s}"
+                )
+            if time_s > self.time_gap_s:
+                raise ValueError(
+                    f"preview_s {time_s} is beyond time_gap_s {self.time_gap_s}: what a follower "
+                    "will be told further ahead does not exist yet"
+                )
+        if self.horizon_s / self.physics_period_s > MAX_STEPS:
+            raise ValueError(
+                f"horizon_s {self.horizon_s} is more than {MAX_STEPS} steps of physics_period_s"
+            )
+        room_mm = 2 * self.robot.outline_radius_mm
+        if self.robots > 1 and self.start_spacing_mm <= room_mm:
+            raise ValueError(
+                f"start_spacing_mm {self.start_spacing_mm} must be above {room_mm:g}, or the "
+                "robots touch at the start"
+            )
+        constant_effects(self.disturbance)
+        return self
+
+    @property
+    def substeps(self) -> int:
+        """Physics steps per control step."""
+        return round(self.control_period_s / self.physics_period_s)
+
+    @property
+    def horizon_steps(self) -> int:
+        """Control steps per episode."""
+        return round(self.horizon_s / self.control_period_s)
+
+    @property
+    def gap_steps(self) -> int:
+        """Control steps per time gap."""
+        return round(self.time_gap_s / self.control_period_s)
+
+    @property
+    def preview_steps(self) -> tuple[int, ...]:
+        """Control steps to each preview."""
+        return tuple(round(time_s / self.control_period_s) for time_s in self.preview_s)
+
+    @property
+    def settle_s(self) -> float:
+        """Errors are counted from here on: 40 % of the horizon."""
+        return SETTLE_FRACTION * self.horizon_s
+
+
+def load_scenario(
+    source: str | Path | Mapping[str, Any] | Scenario = "infinity",
+    *,
+    disturbance_level: float | None = None,
+    **overrides: Any,
+) -> Scenario:
+    """A scenario from a preset's name, a YAML file, a mapping or a scenario, with fields overridden.
+
+    Parameters
+    ----------
+    source
+        ``"infinity"`` or another preset, a path to a YAML file, a mapping, or a :class:`Scenario`.
+    disturbance_level
+        Overrides the level of whatever disturbance results.
+    **overrides
+        Fields of :class:`Scenario`; None leaves the source's value. Mappings are merged.
+
+    Raises
+    ------
+    ValueError
+        in one line that names the value and what is allowed.
+    """
+    if isinstance(source, Scenario):
+        data = source.model_dump()
+    elif isinstance(source, Mapping):
+        data = dict(source)
+    else:
+        data = _read_source(source)
+    for key, value in overrides.items():
+        if value is not None:
+            data[key] = _merged(data.get(key), value)
+    if disturbance_level is not None:
+        data["disturbance"] = _with_level(data.get("disturbance", {}), disturbance_level)
+    try:
+        return Scenario.model_validate(data)
+    except ValidationError as error:
+        raise ValueError(one_line(error)) from error
+
+
+def _read_source(source: str | Path) -> dict[str, Any]:
+    text = str(source)
+    if text in preset_names():
+        return {"name": text, **read_yaml(presets_folder() / f"{text}.yaml")}
+    path = Path(source)
+    if path.suffix in (".yaml", ".yml"):
+        return {"name": path.stem, **read_yaml(path)}
+    raise ValueError(
+        f"scenario {text!r} is neither a preset ({', '.join(preset_names())}) nor a .yaml file"
+    )
+
+
+def _merged(old: Any, new: Any) -> Any:
+    if isinstance(old, Mapping) and isinstance(new, Mapping) and "type" not in new:
+        return {**old, **{key: _merged(old.get(key), value) for key, value in new.items()}}
+    return new
+
+
+def _with_level(disturbance: Any, level: float) -> dict[str, Any]:
+    if isinstance(disturbance, str):
+        disturbance = _disturbance_preset(disturbance)
+    elif isinstance(disturbance, Disturbance):
+        disturbance = disturbance.model_dump()
+    if not isinstance(level, int | float) or not math.isfinite(level) or level < 0:
+        raise ValueError(f"disturbance_level {level!r} must be a finite number, at least 0")
+    return {**disturbance, "level": level}
