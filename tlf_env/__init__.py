@@ -1,0 +1,46 @@
+"""Time-gap leader-follower control of wheeled robots that slip, as a multi-agent environment.
+
+>>> import tlf_env
+>>> env = tlf_env.parallel_env("infinity")
+>>> observations, infos = env.reset(seed=0)
+"""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any
+
+import pettingzoo
+
+if TYPE_CHECKING:
+    from tlf_env.envs.parallel import aec_env, parallel_env
+    from tlf_env.task.scenario import Scenario, load_scenario
+
+__version__ = "0.1.0"
+__all__ = ["Scenario", "__version__", "aec_env", "load_scenario", "parallel_env"]
+
+_PLACES = {
+    "aec_env": "tlf_env.envs.parallel",
+    "parallel_env": "tlf_env.envs.parallel",
+    "Scenario": "tlf_env.task.scenario",
+    "load_scenario": "tlf_env.task.scenario",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _PLACES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    import importlib
+
+    return getattr(importlib.import_module(_PLACES[name]), name)
+
+
+for _task in ("infinity", "flower"):
+    pettingzoo.register(
+        "parallel",
+        f"tlf_env/{_task}-v0",
+        "tlf_env.envs.parallel:parallel_env",
+        kwargs={"scenario": _task},
+    )
+    pettingzoo.register(
+        "aec", f"tlf_env/{_task}-v0", "tlf_env.envs.parallel:aec_env", kwargs={"scenario": _task}
+    )

@@ -116,8 +116,10 @@ class Arrays(NamedTuple):
     terms: np.ndarray  # (lane, robot, RewardTerms)
     rewards: np.ndarray  # (lane, robot)
     infos: np.ndarray  # (lane, robot, Info)
-    lost: np.ndarray  # (lane, robot) bool, in this step
-    touched: np.ndarray  # (lane, robot) bool, in this step
+    lost: np.ndarray  # (lane, robot) bool, at any time so far
+    touched: np.ndarray
+    lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
+    touched_now: np.ndarray
     scales: np.ndarray  # (entry,)
     weights: np.ndarray  # (RewardTerms,)
     previews: np.ndarray  # (preview,) int64, in control steps
@@ -176,6 +178,8 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         infos=np.zeros((lanes, n, len(Info._fields))),
         lost=np.zeros((lanes, n), dtype=np.bool_),
         touched=np.zeros((lanes, n), dtype=np.bool_),
+        lost_now=np.zeros((lanes, n), dtype=np.bool_),
+        touched_now=np.zeros((lanes, n), dtype=np.bool_),
         scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
         weights=np.array([scenario.reward[name] for name in RewardTerms._fields]),
         previews=np.array(scenario.preview_steps, dtype=np.int64),

@@ -9,6 +9,7 @@ pymunk plant calls :func:`actuate` and :func:`sense` one substep at a time while
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,7 +66,7 @@ from tlf_env.task.arrays import (
 )
 from tlf_env.task.channels import POSITION_NOISE
 from tlf_env.task.disturbance import Effects
-from tlf_env.task.measures import TIME_GAP_WINDOW_S, distance, time_gap_error
+from tlf_env.task.measures import distance, time_gap_error
 from tlf_env.task.observation import Tracking, preview_entries, scaled
 from tlf_env.task.reward import reward_terms
 
@@ -73,6 +74,29 @@ TWIST, WHEEL_SPEED = 0, 1
 FULL_SPEED_MM_S = 1000.0
 FULL_YAW_RATE_RAD_S = 8.0
 FULL_WHEEL_SPEED_RAD_S = 25.0
+
+
+
+class Settings(NamedTuple):
+    """Numbers of a scenario that all robots share."""
+
+    kind: int  # of the action
+    kinematic: bool
+    substeps: int
+    dt: float  # physics period, s
+    period: float  # control period, s
+    gap: int  # control steps of the time gap
+    lookahead: int  # control steps of the longest preview
+    window: int  # control steps around one gap ago in which the time gap is measured
+    observer_gain: float  # 1/s
+    smoothing: float  # s
+    lost_beyond: float  # mm
+
+
+DONE, MUST_COLLIDE = -1, -2
+# Outlines that could come closer than this within a control step are stepped through the space.
+CLOSE_MARGIN_MM = 10.0
+FASTEST_CHANGE_MM_S2 = 1500.0  # above what all three tyres can do at twice the paper's friction
 
 NO_PUSH = Push(0.0, 0.0, 0.0)
 
@@ -177,11 +201,11 @@ def sense_robot(
     )
 
 
-@driver
+@block
 def take_actions(a: Arrays, kind: int) -> int:
     """Clip the actions and turn them into commands; clears the traces.
 
-    Returns −1, or lane · robots + robot of the first action that is not finite; then nothing changes.
+    Returns ``DONE``, or lane · robots + robot of the first action that is not finite; then nothing changes.
     """
     lanes, robots = a.actions.shape[0], a.actions.shape[1]
     for lane in range(lanes):
@@ -198,64 +222,63 @@ def take_actions(a: Arrays, kind: int) -> int:
             a.actions[lane, r, 0], a.actions[lane, r, 1] = a_0, a_1
             body = read_body(a.bodies, r, lane)
             a.commands[0, r, lane], a.commands[1, r, lane] = wheel_command(a_0, a_1, kind, body)
-            a.touched[lane, r] = False
+            a.lost_now[lane, r] = a.touched_now[lane, r] = False
     a.traces[:] = 0.0
-    return -1
+    return DONE
 
 
-@driver
-def advance(a: Arrays, kinematic: bool, substeps: int, dt: float) -> None:
-    """Run ``substeps`` substeps of every robot, each by itself."""
-    for lane in range(a.clock.shape[0]):
-        seed, episode, first = a.seeds[lane], a.clock[lane, 2], a.clock[lane, 0]
-        for r in range(a.motions.shape[1]):
-            body = read_body(a.bodies, r, lane)
-            loop = read_wheel_loop(a.wheel_loops, r, lane)
-            ekf = read_ekf(a.ekfs, r, lane)
-            effects = read_effects(a.effects, r, lane)
-            motion = read_motion(a.motions, r, lane)
-            contact = read_contact(a.contacts, r, lane)
-            held = read_loop_state(a.loop_states, r, lane)
-            sensors = read_sensors(a.sensors, r, lane)
-            estimate = read_estimate(a.estimates, r, lane)
-            trace = read_trace(a.traces, r, lane)
-            wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
-            for k in range(substeps):
-                motion, contact, held, trace = actuate_robot(
-                    body,
-                    loop,
-                    effects,
-                    motion,
-                    contact,
-                    held,
-                    sensors,
-                    trace,
-                    wanted_l,
-                    wanted_r,
-                    kinematic,
-                    dt,
-                )
-                sensors, estimate, trace = sense_robot(
-                    body,
-                    ekf,
-                    effects,
-                    motion,
-                    sensors,
-                    estimate,
-                    trace,
-                    seed,
-                    episode,
-                    r,
-                    first + k + 1,
-                    dt,
-                )
-            write_motion(a.motions, r, lane, motion)
-            write_contact(a.contacts, r, lane, contact)
-            write_loop_state(a.loop_states, r, lane, held)
-            write_sensors(a.sensors, r, lane, sensors)
-            write_estimate(a.estimates, r, lane, estimate)
-            write_trace(a.traces, r, lane, trace)
-        a.clock[lane, 0] = first + substeps
+@block
+def advance(a: Arrays, lane: int, kinematic: bool, substeps: int, dt: float) -> None:
+    """Run ``substeps`` substeps of every robot of a lane, each by itself."""
+    seed, episode, first = a.seeds[lane], a.clock[lane, 2], a.clock[lane, 0]
+    for r in range(a.motions.shape[1]):
+        body = read_body(a.bodies, r, lane)
+        loop = read_wheel_loop(a.wheel_loops, r, lane)
+        ekf = read_ekf(a.ekfs, r, lane)
+        effects = read_effects(a.effects, r, lane)
+        motion = read_motion(a.motions, r, lane)
+        contact = read_contact(a.contacts, r, lane)
+        held = read_loop_state(a.loop_states, r, lane)
+        sensors = read_sensors(a.sensors, r, lane)
+        estimate = read_estimate(a.estimates, r, lane)
+        trace = read_trace(a.traces, r, lane)
+        wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
+        for k in range(substeps):
+            motion, contact, held, trace = actuate_robot(
+                body,
+                loop,
+                effects,
+                motion,
+                contact,
+                held,
+                sensors,
+                trace,
+                wanted_l,
+                wanted_r,
+                kinematic,
+                dt,
+            )
+            sensors, estimate, trace = sense_robot(
+                body,
+                ekf,
+                effects,
+                motion,
+                sensors,
+                estimate,
+                trace,
+                seed,
+                episode,
+                r,
+                first + k + 1,
+                dt,
+            )
+        write_motion(a.motions, r, lane, motion)
+        write_contact(a.contacts, r, lane, contact)
+        write_loop_state(a.loop_states, r, lane, held)
+        write_sensors(a.sensors, r, lane, sensors)
+        write_estimate(a.estimates, r, lane, estimate)
+        write_trace(a.traces, r, lane, trace)
+    a.clock[lane, 0] = first + substeps
 
 
 @driver
@@ -305,6 +328,7 @@ def sense(a: Arrays, dt: float) -> None:
         write_estimate(a.estimates, r, 0, estimate)
         write_trace(a.traces, r, 0, trace)
     a.clock[0, 0] = tick
+    mark_touched(a, 0)
 
 
 @law
@@ -316,7 +340,7 @@ def wanted_of_formation(a: Arrays, lane: int, r: int, step: int, gap: int) -> tu
 
 @block
 def next_reference(
-    a: Arrays, lane: int, r: int, m: int, gap: int, gain: float, smoothing_s: float, period: float
+    a: Arrays, lane: int, r: int, m: int, s: Settings
 ) -> None:
     """Put the reference of control step ``m`` into the ring and move the follower's observer on."""
     slot = m % a.references.shape[1]
@@ -324,7 +348,7 @@ def next_reference(
         for i in range(5):
             a.references[i, slot, r, lane] = a.table[m, i]
         return
-    old = max(m - gap, 0) % a.messages.shape[1]
+    old = max(m - s.gap, 0) % a.messages.shape[1]
     delayed = Message(
         a.messages[0, old, r - 1, lane],
         a.messages[1, old, r - 1, lane],
@@ -334,14 +358,14 @@ def next_reference(
     )
     x, y = a.observers[0, r, lane], a.observers[1, r, lane]
     theta = a.observers[2, r, lane]
-    factor = smoothing(m * period, smoothing_s)
-    rate_x, rate_y, rate_theta = observer_rates(x, y, theta, delayed, gain, factor)
+    factor = smoothing(m * s.period, s.smoothing)
+    rate_x, rate_y, rate_theta = observer_rates(x, y, theta, delayed, s.observer_gain, factor)
     reference = observed_reference(x, y, theta, rate_x, rate_y, rate_theta)
     for i in range(5):
         a.references[i, slot, r, lane] = reference[i]
-    a.observers[0, r, lane] = x + period * rate_x
-    a.observers[1, r, lane] = y + period * rate_y
-    a.observers[2, r, lane] = theta + period * rate_theta
+    a.observers[0, r, lane] = x + s.period * rate_x
+    a.observers[1, r, lane] = y + s.period * rate_y
+    a.observers[2, r, lane] = theta + s.period * rate_theta
 
 
 @law
@@ -377,7 +401,7 @@ def broadcast(a: Arrays, lane: int, r: int, step: int, period: float) -> None:
 
 
 @block
-def observe_robot(a: Arrays, lane: int, r: int, step: int, substeps: int, period: float) -> None:
+def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     """Write the ``tracking`` observation of one robot."""
     robots = a.motions.shape[1]
     estimate = read_estimate(a.estimates, r, lane)
@@ -388,7 +412,7 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, substeps: int, period
     )
     e_3 = reference.theta - estimate.theta
     sin_e3, cos_e3 = math.sin(e_3), math.cos(e_3)
-    per_substep = 1.0 / substeps
+    per_substep = 1.0 / s.substeps
     to_Nmm = per_substep / MILLINEWTON_PER_NEWTON
     row = Tracking(
         e_1,
@@ -400,8 +424,8 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, substeps: int, period
         sin_e3,
         reference.u_1,
         reference.u_2,
-        trace.distance / period,
-        trace.turn / period,
+        trace.distance / s.period,
+        trace.turn / s.period,
         a.last_actions[lane, r, 0],
         a.last_actions[lane, r, 1],
         trace.innovation_forward * per_substep,
@@ -426,7 +450,7 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, substeps: int, period
 
 @block
 def judge_robot(
-    a: Arrays, lane: int, r: int, step: int, gap: int, substeps: int, period: float, lost_beyond: float
+    a: Arrays, lane: int, r: int, step: int, s: Settings
 ) -> None:
     """Write the true errors, the reward terms and whether one robot is lost."""
     motion = read_motion(a.motions, r, lane)
@@ -435,12 +459,12 @@ def judge_robot(
     reference = read_reference(a, lane, r, step)
     trace = read_trace(a.traces, r, lane)
     error = distance(x, y, reference.x, reference.y)
-    wanted_x, wanted_y = wanted_of_formation(a, lane, r, step, gap)
+    wanted_x, wanted_y = wanted_of_formation(a, lane, r, step, s.gap)
     late = 0.0
     if r > 0:
-        window = int(round(TIME_GAP_WINDOW_S / period))
-        late = time_gap_error(x, y, a.paths[:, :, r - 1, lane], step, gap, window, period)
-    to_Nmm = 1.0 / (substeps * MILLINEWTON_PER_NEWTON)
+        path = a.paths[:, :, r - 1, lane]
+        late = time_gap_error(x, y, path, step, s.gap, s.window, s.period)
+    to_Nmm = 1.0 / (s.substeps * MILLINEWTON_PER_NEWTON)
     info = Info(
         error,
         distance(x, y, wanted_x, wanted_y),
@@ -449,8 +473,8 @@ def judge_robot(
         trace.slip,
         trace.torque_l * to_Nmm,
         trace.torque_r * to_Nmm,
-        trace.saturated / substeps,
-        trace.nis / substeps,
+        trace.saturated / s.substeps,
+        trace.nis / s.substeps,
         x,
         y,
         motion.theta,
@@ -462,13 +486,15 @@ def judge_robot(
     for i in range(len(info)):
         a.infos[lane, r, i] = info[i]
 
-    a.lost[lane, r] = error > lost_beyond
+    if error > s.lost_beyond and not a.lost[lane, r]:
+        a.lost[lane, r] = a.lost_now[lane, r] = True
     size = change = 0.0
     for i in range(a.actions.shape[2]):
         size += a.actions[lane, r, i] ** 2
         change += (a.actions[lane, r, i] - a.last_actions[lane, r, i]) ** 2
         a.last_actions[lane, r, i] = a.actions[lane, r, i]
-    terms = reward_terms(error, change, size, trace.slip, a.lost[lane, r], a.touched[lane, r])
+    lost, touched = a.lost_now[lane, r], a.touched_now[lane, r]
+    terms = reward_terms(error, change, size, trace.slip, lost, touched)
     total = 0.0
     for i in range(len(terms)):
         a.terms[lane, r, i] = terms[i]
@@ -477,51 +503,58 @@ def judge_robot(
 
 
 @driver
-def begin(
-    a: Arrays, lane: int, gap: int, lookahead: int, gain: float, smoothing_s: float, period: float
-) -> None:
-    """After the poses of a lane are set: first message, references up to the preview, first paths."""
+def begin(a: Arrays, lane: int, s: Settings) -> None:
+    """After the poses of a lane are set: first messages, references up to the preview, observations."""
     robots = a.motions.shape[1]
     for r in range(robots):
-        broadcast(a, lane, r, 0, period)
+        broadcast(a, lane, r, 0, s.period)
         record_truth(a, lane, r, 0)
     for r in range(robots):
-        for m in range(lookahead + 1):
-            next_reference(a, lane, r, m, gap, gain, smoothing_s, period)
+        for m in range(s.lookahead + 1):
+            next_reference(a, lane, r, m, s)
+        judge_robot(a, lane, r, 0, s)
+        observe_robot(a, lane, r, 0, s)
 
 
-@driver
-def conclude(
-    a: Arrays,
-    gap: int,
-    lookahead: int,
-    substeps: int,
-    gain: float,
-    smoothing_s: float,
-    period: float,
-    lost_beyond: float,
-) -> None:
+@block
+def conclude_lane(a: Arrays, lane: int, s: Settings) -> None:
     """After the substeps of a control step: radio, observers, errors, rewards and observations."""
     robots = a.motions.shape[1]
-    for lane in range(a.clock.shape[0]):
-        step = a.clock[lane, 1] + 1
-        a.clock[lane, 1] = step
-        for r in range(robots):
-            broadcast(a, lane, r, step, period)
-            record_truth(a, lane, r, step)
-        for r in range(robots):
-            next_reference(a, lane, r, step + lookahead, gap, gain, smoothing_s, period)
-            judge_robot(a, lane, r, step, gap, substeps, period, lost_beyond)
-            observe_robot(a, lane, r, step, substeps, period)
+    step = a.clock[lane, 1] + 1
+    a.clock[lane, 1] = step
+    for r in range(robots):
+        broadcast(a, lane, r, step, s.period)
+        record_truth(a, lane, r, step)
+    for r in range(robots):
+        next_reference(a, lane, r, step + s.lookahead, s)
+        judge_robot(a, lane, r, step, s)
+        observe_robot(a, lane, r, step, s)
 
 
 @driver
-def observe(a: Arrays, lane: int, gap: int, substeps: int, period: float, lost_beyond: float) -> None:
-    """Errors and observations of a lane as it stands, for the first observation of an episode."""
-    for r in range(a.motions.shape[1]):
-        judge_robot(a, lane, r, a.clock[lane, 1], gap, substeps, period, lost_beyond)
-        observe_robot(a, lane, r, a.clock[lane, 1], substeps, period)
-        a.infos[lane, r, CLIPPED] = 0.0
+def conclude(a: Arrays, s: Settings) -> None:
+    """:func:`conclude_lane` of lane 0, for a control step that went through the space."""
+    conclude_lane(a, 0, s)
+
+
+@driver
+def control_step(a: Arrays, s: Settings) -> int:
+    """A whole control step of lane 0.
+
+    Returns ``DONE``; or the number of the first robot whose action is not finite, and nothing has
+    changed; or ``MUST_COLLIDE``: robots are close, actions are taken, and the substeps are left to
+    the plant's space.
+    """
+    bad = take_actions(a, s.kind)
+    if bad != DONE:
+        return bad
+    if not s.kinematic and not room_to_move(a, 0, s.period):
+        return MUST_COLLIDE
+    advance(a, 0, s.kinematic, s.substeps, s.dt)
+    if s.kinematic:
+        mark_touched(a, 0)
+    conclude_lane(a, 0, s)
+    return DONE
 
 
 @law
@@ -532,12 +565,9 @@ def outline_centre(a: Arrays, lane: int, r: int) -> tuple[float, float]:
     return motion.x - ahead * math.sin(motion.theta), motion.y + ahead * math.cos(motion.theta)
 
 
-@driver
-def room_to_move(a: Arrays, lane: int, duration: float, change: float, margin: float) -> bool:
-    """Whether no two outlines (circles) can come within ``margin`` mm during ``duration`` s.
-
-    ``change`` (mm/s²) bounds what the floor can do to a robot's speed meanwhile.
-    """
+@block
+def room_to_move(a: Arrays, lane: int, duration: float) -> bool:
+    """Whether no two outlines (circles) can meet, or nearly so, during ``duration`` s."""
     robots = a.motions.shape[1]
     for i in range(robots):
         x_i, y_i = outline_centre(a, lane, i)
@@ -545,8 +575,8 @@ def room_to_move(a: Arrays, lane: int, duration: float, change: float, margin: f
         for j in range(i):
             x_j, y_j = outline_centre(a, lane, j)
             room = a.bodies[BODY_OUTLINE, i, lane] + a.bodies[BODY_OUTLINE, j, lane]
-            closing = speed_i + outline_speed(a, lane, j) + 2.0 * change * duration
-            if distance(x_i, y_i, x_j, y_j) - room <= margin + closing * duration:
+            closing = speed_i + outline_speed(a, lane, j) + 2.0 * FASTEST_CHANGE_MM_S2 * duration
+            if distance(x_i, y_i, x_j, y_j) - room <= CLOSE_MARGIN_MM + closing * duration:
                 return False
     return True
 
@@ -559,7 +589,14 @@ def outline_speed(a: Arrays, lane: int, r: int) -> float:
     return math.sqrt(motion.v_x * motion.v_x + motion.v_y * motion.v_y) + swing
 
 
-@driver
+@law
+def touch(a: Arrays, lane: int, r: int) -> None:
+    """Remember that robot ``r`` touched another."""
+    if not a.touched[lane, r]:
+        a.touched[lane, r] = a.touched_now[lane, r] = True
+
+
+@block
 def mark_touched(a: Arrays, lane: int) -> None:
     """Set ``touched`` for robots whose outlines meet."""
     robots = a.motions.shape[1]
@@ -569,7 +606,8 @@ def mark_touched(a: Arrays, lane: int) -> None:
             x_j, y_j = outline_centre(a, lane, j)
             room = a.bodies[BODY_OUTLINE, i, lane] + a.bodies[BODY_OUTLINE, j, lane]
             if distance(x_i, y_i, x_j, y_j) <= room:
-                a.touched[lane, i] = a.touched[lane, j] = True
+                touch(a, lane, i)
+                touch(a, lane, j)
 
 
 CLIPPED = Info._fields.index("clipped")

@@ -12,21 +12,21 @@ from tlf_env.physics.parameters import RobotParameters
 from tlf_env.physics.pymunk_plant import PymunkPlant
 from tlf_env.task import drivers
 from tlf_env.task.arrays import Arrays, State, make_arrays
+from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.trajectories import sample
 
 ACTION_KINDS = {"twist": drivers.TWIST, "wheel_speed": drivers.WHEEL_SPEED}
-# Outlines that could come closer than this within a control step are stepped through pymunk.
-CLOSE_MARGIN_MM = 10.0
-FASTEST_CHANGE_MM_S2 = 1500.0  # above what all three tyres can do at twice the paper's friction
-
-V_X, V_Y, YAW = (Motion._fields.index(name) for name in ("v_x", "v_y", "w"))
 
 
 def reference_table(scenario: Scenario) -> np.ndarray:
     """The leader's reference at every control step of an episode and of its preview, (step, 5)."""
     steps = scenario.horizon_steps + max(scenario.preview_steps, default=0) + 1
     return sample(scenario.trajectory, np.arange(steps) * scenario.control_period_s)
+
+
+# What each entry of State is divided by in the interface.
+STATE_SCALES = np.array([1000.0, 1000.0, 1.0, 1.0, 1.0, 500.0, 500.0, 2.0, 10.0, 10.0, 1000.0, 1000.0])
 
 
 class Formation:
@@ -39,9 +39,19 @@ class Formation:
         self.scenario = scenario
         self.arrays: Arrays = make_arrays(scenario, reference_table(scenario))
         self.plant = PymunkPlant([scenario.robot] * scenario.robots)
-        self._kinematic = scenario.plant == "kinematic"
-        self._kind = ACTION_KINDS[scenario.action]
-        self._lookahead = max(scenario.preview_steps, default=0)
+        self._settings = drivers.Settings(
+            kind=ACTION_KINDS[scenario.action],
+            kinematic=scenario.plant == "kinematic",
+            substeps=scenario.substeps,
+            dt=scenario.physics_period_s,
+            period=scenario.control_period_s,
+            gap=scenario.gap_steps,
+            lookahead=max(scenario.preview_steps, default=0),
+            window=round(TIME_GAP_WINDOW_S / scenario.control_period_s),
+            observer_gain=scenario.observer.gain_per_s,
+            smoothing=scenario.observer.smoothing_s,
+            lost_beyond=scenario.lost_beyond_mm,
+        )
 
     @property
     def time_s(self) -> float:
@@ -65,23 +75,15 @@ class Formation:
             state[:] = 0.0
         for state in (a.actions, a.last_actions, a.infos):
             state[:] = 0.0
-        a.lost[:] = a.touched[:] = False
+        for flags in (a.lost, a.touched, a.lost_now, a.touched_now):
+            flags[:] = False
         a.clock[0] = 0, 0, episode
         a.seeds[0] = seed
         poses = start_poses(s, a.table[0])
         for r, (x_mm, y_mm, theta) in enumerate(poses):
             self._place(r, x_mm, y_mm, theta)
         self.plant.reset()
-        drivers.begin(
-            a,
-            0,
-            s.gap_steps,
-            self._lookahead,
-            s.observer.gain_per_s,
-            s.observer.smoothing_s,
-            s.control_period_s,
-        )
-        drivers.observe(a, 0, s.gap_steps, s.substeps, s.control_period_s, s.lost_beyond_mm)
+        drivers.begin(a, 0, self._settings)
 
     def _place(self, r: int, x_mm: float, y_mm: float, theta: float) -> None:
         a, d = self.arrays, self.scenario.robot.com_offset_mm
@@ -97,35 +99,15 @@ class Formation:
         ValueError
             for an action that is not finite, naming the robot; then nothing has changed.
         """
-        a, s = self.arrays, self.scenario
-        bad = drivers.take_actions(a, self._kind)
-        if bad >= 0:
-            raise ValueError(
-                f"robot_{bad}: the action must be finite, got {a.actions[0, bad].tolist()}"
-            )
-        if self._kinematic or self._clear():
-            drivers.advance(a, self._kinematic, s.substeps, s.physics_period_s)
-        else:
+        a = self.arrays
+        result = drivers.control_step(a, self._settings)
+        if result == drivers.MUST_COLLIDE:
             self._advance_through_space()
-        if self._kinematic:
-            drivers.mark_touched(a, 0)
-        drivers.conclude(
-            a,
-            s.gap_steps,
-            self._lookahead,
-            s.substeps,
-            s.observer.gain_per_s,
-            s.observer.smoothing_s,
-            s.control_period_s,
-            s.lost_beyond_mm,
-        )
-
-    def _clear(self) -> bool:
-        """Whether no two outlines can meet within this control step."""
-        if self.scenario.robots == 1:
-            return True
-        a, period_s = self.arrays, self.scenario.control_period_s
-        return drivers.room_to_move(a, 0, period_s, FASTEST_CHANGE_MM_S2, CLOSE_MARGIN_MM)
+            drivers.conclude(a, self._settings)
+        elif result != drivers.DONE:
+            raise ValueError(
+                f"robot_{result}: the action must be finite, got {a.actions[0, result].tolist()}"
+            )
 
     def _advance_through_space(self) -> None:
         a, dt_s = self.arrays, self.scenario.physics_period_s
@@ -134,7 +116,6 @@ class Formation:
             drivers.actuate(a, False, dt_s)
             self.plant.collide(before, a.motions, dt_s)
             drivers.sense(a, dt_s)
-            drivers.mark_touched(a, 0)
 
     def state(self) -> np.ndarray:
         """The truth, (robot, :class:`State`), in physical units."""

@@ -1,0 +1,7 @@
+"""Policies that see observations only, and what is done with them: runs, figures, tables, training."""
+
+from __future__ import annotations
+
+from baselines.reference import ReferencePolicy
+
+__all__ = ["ReferencePolicy"]

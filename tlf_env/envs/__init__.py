@@ -1,0 +1,1 @@
+"""The learning libraries' interfaces. No physics and no mathematics: only spaces, dictionaries and ends."""

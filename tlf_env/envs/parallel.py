@@ -1,0 +1,293 @@
+"""The PettingZoo parallel environment."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pymunk
+from pettingzoo import ParallelEnv
+from pettingzoo.utils.conversions import parallel_to_aec
+
+from tlf_env.numerics.philox import MAX_SEED
+from tlf_env.task.arrays import ACTION_SIZE, Info, State
+from tlf_env.task.disturbance import constant_effects
+from tlf_env.task.formation import STATE_SCALES, Formation
+from tlf_env.task.observation import OBSERVATION_LIMIT, tracking_entries
+from tlf_env.task.reward import RewardTerms
+from tlf_env.task.scenario import Scenario, load_scenario
+
+Agent = str
+PETTINGZOO_TEST_OPTION = "options"  # what PettingZoo's own API test passes; means nothing
+
+
+class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
+    """Robots in a row follow each other one time gap apart; every robot is an agent.
+
+    Agents ``robot_0`` (the leader, on the scenario's trajectory) to ``robot_{n-1}``; each follower's
+    reference comes from its predecessor's broadcast of one gap ago. All act at every control step.
+
+    Action
+        ``Box(−1, 1, (2,), float32)``. ``action="twist"``: forward speed (1 = 1000 mm/s) and yaw rate
+        (1 = 8 rad/s, counter-clockwise). ``action="wheel_speed"``: left and right wheel (1 = 25 rad/s).
+        Values outside are clipped and counted in ``info["clipped"]``.
+    Observation
+        ``Box(−10, 10, (n,), float32)``, the ``tracking`` observation: see
+        :data:`tlf_env.task.observation.TRACKING_ENTRIES` for each entry's meaning, unit and scale.
+        Made from what the robot knows on board: estimated pose, odometry, radio. Never the truth.
+    Reward
+        Weighted sum of :class:`tlf_env.task.reward.RewardTerms`.
+    End
+        For the whole formation at once: lost, touched (as ``end_on`` says) or the horizon. The robots
+        concerned are terminated, the others truncated; ``info["end"]`` tells why.
+    Info
+        The fields of :class:`tlf_env.task.arrays.Info`, ``reward`` (the unweighted terms),
+        ``disturbance`` (what acted), ``lost`` and ``touched`` (at any time so far), ``end``.
+
+    Parameters
+    ----------
+    scenario
+        A preset's name, a YAML file, a mapping or a :class:`~tlf_env.task.scenario.Scenario`.
+    render_mode
+        None.
+    **overrides
+        Fields of the scenario; ``disturbance_level`` too.
+
+    Raises
+    ------
+    ValueError
+        for an unknown key or an impossible value, in one line.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Path | Mapping[str, Any] | Scenario = "infinity",
+        *,
+        render_mode: str | None = None,
+        **overrides: Any,
+    ) -> None:
+        self.scenario = load_scenario(scenario, **overrides)
+        self.metadata = {
+            "name": f"tlf_env/{self.scenario.name}-v0",
+            "render_modes": [],
+            "is_parallelizable": True,
+            "render_fps": 1 / self.scenario.control_period_s,
+        }
+        if render_mode is not None:
+            raise ValueError(f"render_mode {render_mode!r} is not one of: None")
+        self.render_mode = render_mode
+        self.possible_agents = [f"robot_{i}" for i in range(self.scenario.robots)]
+        self.agents: list[Agent] = []
+        entries = len(tracking_entries(self.scenario.preview_s))
+        self.observation_spaces = {
+            agent: gymnasium.spaces.Box(
+                -OBSERVATION_LIMIT, OBSERVATION_LIMIT, (entries,), np.float32
+            )
+            for agent in self.possible_agents
+        }
+        self.action_spaces = {
+            agent: gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+            for agent in self.possible_agents
+        }
+        self.state_space = gymnasium.spaces.Box(
+            -np.inf, np.inf, (len(self.possible_agents) * len(State._fields),), np.float32
+        )
+        self._formation = Formation(self.scenario)
+        self._effects = constant_effects(self.scenario.disturbance)._asdict()
+        self._seed: int | None = None
+        self._episode = 0
+
+    @property
+    def formation(self) -> Formation:
+        """The simulation behind the environment; its truth is not for policies."""
+        return self._formation
+
+    @property
+    def space(self) -> pymunk.Space:
+        """The pymunk space, its bodies where the robots are now."""
+        return self._formation.space
+
+    def observation_space(self, agent: Agent) -> gymnasium.spaces.Box:
+        """Space of an agent's observations; the same object at every call."""
+        return self.observation_spaces[agent]
+
+    def action_space(self, agent: Agent) -> gymnasium.spaces.Box:
+        """Space of an agent's actions; the same object at every call."""
+        return self.action_spaces[agent]
+
+    def reset(
+        self, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[dict[Agent, np.ndarray], dict[Agent, dict[str, Any]]]:
+        """Start an episode.
+
+        Parameters
+        ----------
+        seed
+            0 to 2⁶³ − 1. The same seed gives the same episode, bit for bit. Without one the next
+            episode of the last seed begins, or of a random one where there was none.
+        options
+            None are known.
+
+        Raises
+        ------
+        ValueError
+            for a seed out of its range or an unknown option.
+        """
+        unknown = sorted(set(options or {}) - {PETTINGZOO_TEST_OPTION})
+        if unknown:
+            raise ValueError(f"reset option {unknown[0]!r} is unknown; there are none")
+        if seed is not None:
+            self._seed, self._episode = checked_seed(seed), 0
+        elif self._seed is None:
+            self._seed, self._episode = int(np.random.SeedSequence().entropy) % MAX_SEED, 0
+        else:
+            self._episode += 1
+        self._formation.reset(self._seed, self._episode)
+        self.agents = list(self.possible_agents)
+        return self._observations(), self._infos()
+
+    def step(
+        self, actions: dict[Agent, np.ndarray]
+    ) -> tuple[
+        dict[Agent, np.ndarray],
+        dict[Agent, float],
+        dict[Agent, bool],
+        dict[Agent, bool],
+        dict[Agent, dict[str, Any]],
+    ]:
+        """Advance all robots by one control period.
+
+        Parameters
+        ----------
+        actions
+            One action for every agent.
+
+        Raises
+        ------
+        ValueError
+            for a missing, unknown, wrongly shaped or non-finite action, naming the robot; the
+            episode stands as it was.
+        RuntimeError
+            before the first :meth:`reset`.
+        """
+        if not self.agents:
+            if self._seed is None:
+                raise RuntimeError("call reset() before step()")
+            return {}, {}, {}, {}, {}
+        self._take(actions)
+        self._formation.step()
+        a = self._formation.arrays
+        rewards = dict(zip(self.agents, a.rewards[0].tolist(), strict=True))
+        terminated, truncated, ends = self._ends()
+        observations, infos = self._observations(), self._infos()
+        if ends:
+            for agent, reason in ends.items():
+                infos[agent]["end"] = reason
+            self.agents = []
+        return observations, rewards, terminated, truncated, infos
+
+    def _take(self, actions: dict[Agent, np.ndarray]) -> None:
+        buffer = self._formation.arrays.actions[0]
+        if len(actions) != len(self.agents):
+            self._complain(actions)
+        for i, agent in enumerate(self.agents):
+            try:
+                action = actions[agent]
+            except KeyError:
+                self._complain(actions)
+            if np.shape(action) != (ACTION_SIZE,):
+                raise ValueError(
+                    f"{agent}: the action must have the shape ({ACTION_SIZE},), "
+                    f"got {np.shape(action)}"
+                )
+            buffer[i] = action
+
+    def _complain(self, actions: dict[Agent, np.ndarray]) -> None:
+        unknown = [agent for agent in actions if agent not in self.agents]
+        missing = [agent for agent in self.agents if agent not in actions]
+        what = f"{unknown[0]!r} is no agent" if unknown else f"no action for {missing[0]}"
+        raise ValueError(f"{what}; the agents are {', '.join(self.agents)}")
+
+    def _ends(self) -> tuple[dict[Agent, bool], dict[Agent, bool], dict[Agent, str]]:
+        a, s = self._formation.arrays, self.scenario
+        ends: dict[Agent, str] = {}
+        if "lost" in s.end_on and a.lost_now.any():
+            ends = {self.agents[r]: "lost" for r in np.flatnonzero(a.lost_now[0])}
+        if "touched" in s.end_on and a.touched_now.any():
+            ends |= {self.agents[r]: "touched" for r in np.flatnonzero(a.touched_now[0])}
+        terminated = {agent: agent in ends for agent in self.agents}
+        rest = "horizon" if self._formation.step_count >= s.horizon_steps else None
+        if ends:
+            rest = "other_robot"
+        truncated = {agent: rest is not None and agent not in ends for agent in self.agents}
+        if rest is not None:
+            ends = {agent: ends.get(agent, rest) for agent in self.agents}
+        return terminated, truncated, ends
+
+    def _observations(self) -> dict[Agent, np.ndarray]:
+        fresh = self._formation.arrays.observations[0].copy()
+        return dict(zip(self.possible_agents, fresh, strict=True))
+
+    def _infos(self) -> dict[Agent, dict[str, Any]]:
+        a = self._formation.arrays
+        infos: dict[Agent, dict[str, Any]] = {}
+        for agent, values, terms, lost, touched in zip(
+            self.possible_agents,
+            a.infos[0].tolist(),
+            a.terms[0].tolist(),
+            a.lost[0].tolist(),
+            a.touched[0].tolist(),
+            strict=True,
+        ):
+            info: dict[str, Any] = dict(zip(Info._fields, values, strict=True))
+            info["reward"] = dict(zip(RewardTerms._fields, terms, strict=True))
+            info["disturbance"] = dict(self._effects)
+            info["lost"], info["touched"] = lost, touched
+            infos[agent] = info
+        return infos
+
+    def state(self) -> np.ndarray:
+        """The truth for critics, float32: :class:`tlf_env.task.arrays.State` of every robot, scaled."""
+        return (self._formation.state() / STATE_SCALES).astype(np.float32).ravel()
+
+    def render(self) -> None:
+        """Nothing: there is no render mode."""
+
+    def close(self) -> None:
+        """Nothing to release."""
+
+
+def checked_seed(seed: int) -> int:
+    """A seed as a plain int.
+
+    Raises
+    ------
+    ValueError
+        if it is no whole number from 0 to 2⁶³ − 1.
+    """
+    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed <= MAX_SEED:
+        raise ValueError(f"seed {seed!r} must be a whole number from 0 to {MAX_SEED}")
+    return int(seed)
+
+
+def parallel_env(
+    scenario: str | Path | Mapping[str, Any] | Scenario = "infinity",
+    *,
+    render_mode: str | None = None,
+    **overrides: Any,
+) -> FormationParallelEnv:
+    """Make the parallel environment; see :class:`FormationParallelEnv`."""
+    return FormationParallelEnv(scenario, render_mode=render_mode, **overrides)
+
+
+def aec_env(
+    scenario: str | Path | Mapping[str, Any] | Scenario = "infinity",
+    *,
+    render_mode: str | None = None,
+    **overrides: Any,
+) -> Any:
+    """Make the turn-based form of the environment, by PettingZoo's own conversion."""
+    return parallel_to_aec(parallel_env(scenario, render_mode=render_mode, **overrides))
