@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import secrets
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -142,7 +143,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         if seed is not None:
             self._seed, self._episode = checked_seed(seed), 0
         elif self._seed is None:
-            self._seed, self._episode = int(np.random.SeedSequence().entropy) % MAX_SEED, 0
+            self._seed, self._episode = secrets.randbelow(MAX_SEED), 0
         else:
             self._episode += 1
         self._formation.reset(self._seed, self._episode)
@@ -268,7 +269,11 @@ def checked_seed(seed: int) -> int:
     ValueError
         if it is no whole number from 0 to 2⁶³ − 1.
     """
-    if isinstance(seed, bool) or not isinstance(seed, int | np.integer) or not 0 <= seed <= MAX_SEED:
+    if (
+        isinstance(seed, bool)
+        or not isinstance(seed, int | np.integer)
+        or not 0 <= seed <= MAX_SEED
+    ):
         raise ValueError(f"seed {seed!r} must be a whole number from 0 to {MAX_SEED}")
     return int(seed)
 

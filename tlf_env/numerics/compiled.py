@@ -18,7 +18,7 @@ import os
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, TypeVar
 
 import numba
 import platformdirs
@@ -87,7 +87,7 @@ def driver(function: F) -> F:
     return compiled
 
 
-def reader(row: type[NamedTuple]) -> Callable[..., Any]:  # type: ignore[valid-type]
+def reader(row: type[Any]) -> Callable[..., Any]:
     """Compiled ``read(array, robot, lane)`` that gathers a named tuple from ``array[field, robot, lane]``."""
     fields = ", ".join(f"a[{i}, r, l]" for i in range(len(row._fields)))
     scope: dict[str, Any] = {"Row": row}
@@ -95,7 +95,7 @@ def reader(row: type[NamedTuple]) -> Callable[..., Any]:  # type: ignore[valid-t
     return law(scope["read"])
 
 
-def writer(row: type[NamedTuple]) -> Callable[..., Any]:  # type: ignore[valid-type]
+def writer(row: type[Any]) -> Callable[..., Any]:
     """Compiled ``write(array, robot, lane, row)``, the inverse of :func:`reader`."""
     lines = "\n".join(f"    a[{i}, r, l] = row.{name}" for i, name in enumerate(row._fields))
     scope: dict[str, Any] = {}

@@ -26,9 +26,11 @@ UNIT = 2.0**-53
 
 MAX_SEED = 2**63 - 1
 
+Words = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
+
 
 @law
-def high_product(a: int, b: int) -> int:
+def high_product(a: np.uint64, b: np.uint64) -> np.uint64:
     """Upper 64 bits of the product of two unsigned 64-bit integers."""
     a_low, a_high = a & LOW_32, a >> SHIFT_32
     b_low, b_high = b & LOW_32, b >> SHIFT_32
@@ -38,7 +40,9 @@ def high_product(a: int, b: int) -> int:
 
 
 @law
-def philox(c_0: int, c_1: int, c_2: int, c_3: int, k_0: int, k_1: int) -> tuple[int, int, int, int]:
+def philox(
+    c_0: np.uint64, c_1: np.uint64, c_2: np.uint64, c_3: np.uint64, k_0: np.uint64, k_1: np.uint64
+) -> Words:
     """Four random words for a counter of four words and a key of two; all ``uint64``."""
     for _ in range(ROUNDS):
         high_0 = high_product(MULTIPLIER_0, c_0)
@@ -52,16 +56,16 @@ def philox(c_0: int, c_1: int, c_2: int, c_3: int, k_0: int, k_1: int) -> tuple[
 
 
 @law
-def words(seed: int, channel: int, robot: int, episode: int, index: int) -> tuple[int, int, int, int]:
+def words(seed: int, channel: int, robot: int, episode: int, index: int) -> Words:
     """The four words of one draw; all arguments are whole numbers from 0 on."""
     key = (np.uint64(channel) << SHIFT_32) | np.uint64(robot)
     return philox(np.uint64(index), np.uint64(episode), ZERO, ZERO, np.uint64(seed), key)
 
 
 @law
-def unit(word: int) -> float:
+def unit(word: np.uint64) -> float:
     """A float in [0, 1) from the upper 53 bits of a word."""
-    return (word >> SHIFT_11) * UNIT
+    return float(word >> SHIFT_11) * UNIT
 
 
 @law

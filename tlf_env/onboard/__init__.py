@@ -1,3 +1,5 @@
-"""What runs on each robot: sensors, EKF and wheel loop at the sensor rate; radio, observer and tracking law
-at the control period. Knows encoders, fixes and messages; knows no true state and no reward.
+"""What runs on each robot, from what the robot can know: encoders, fixes and messages.
+
+At the sensor rate encoders, position fix, EKF and wheel loop; at the control period radio, observer and
+tracking law. No true state and no reward.
 """

@@ -58,9 +58,7 @@ def tracking_gains(name: str) -> TrackingGains:
 
 def gains_row(gains: TrackingGains) -> Gains:
     """The gains as the compiled law takes them."""
-    return Gains(
-        gains.k_1_per_s, gains.k_2_mm2_s, gains.k_3_mm2, gains.eta, gains.epsilon
-    )
+    return Gains(gains.k_1_per_s, gains.k_2_mm2_s, gains.k_3_mm2, gains.eta, gains.epsilon)
 
 
 @law

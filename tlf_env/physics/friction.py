@@ -1,4 +1,4 @@
-"""Friction laws: the coefficient's curve, joint friction of eq. (5), and a Coulomb disc solved exactly."""
+"""Friction laws: the coefficient's curve, and a Coulomb disc solved exactly."""
 
 from __future__ import annotations
 
@@ -18,21 +18,6 @@ def coefficient(
     x = (abs(speed) - stiction_speed) / (dynamic_speed - stiction_speed)
     x = min(max(x, 0.0), 1.0)
     return mu_static + (mu_dynamic - mu_static) * x * x * (3.0 - 2.0 * x)
-
-
-@law
-def joint_torque(
-    mu: float,
-    axial_arm: float,
-    radial_arm: float,
-    bending_ratio: float,
-    preload: float,
-    axial: float,
-    radial: float,
-    moment: float,
-) -> float:
-    """Largest friction torque of a joint, eq. (5), in mN·mm; forces in mN, arms in mm, moment in mN·mm."""
-    return mu * (axial_arm * abs(axial) + radial_arm * radial + bending_ratio * abs(moment) + preload)
 
 
 @law

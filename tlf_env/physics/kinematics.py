@@ -5,8 +5,8 @@ from __future__ import annotations
 import math
 
 from tlf_env.numerics.compiled import law
-from tlf_env.physics.kernel import Motion
 from tlf_env.physics.parameters import Body
+from tlf_env.physics.state import Motion
 
 
 @law

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 import math
 from pathlib import Path
@@ -12,26 +13,26 @@ from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_val
 
 from tlf_env.numerics.compiled import driver
 from tlf_env.numerics.errors import one_line
-from tlf_env.physics.kernel import (
-    Contact,
-    Floor,
-    Motion,
-    Push,
-    advance_pose,
-    axle_midpoint,
-    read_body,
-    read_contact,
-    read_motion,
-    substep,
-    write_contact,
-    write_motion,
-)
+from tlf_env.numerics.files import atomic
+from tlf_env.physics.kernel import substep
 from tlf_env.physics.parameters import (
     MILLINEWTON_PER_NEWTON,
     Frozen,
     Positive,
     RobotParameters,
     body_array,
+)
+from tlf_env.physics.state import (
+    Contact,
+    Floor,
+    Motion,
+    Push,
+    advance_pose,
+    read_body,
+    read_contact,
+    read_motion,
+    write_contact,
+    write_motion,
 )
 
 COLUMNS = (
@@ -83,7 +84,7 @@ class OpenLoopScenario(Frozen):
     @model_validator(mode="after")
     def _check_order(self) -> Self:
         times = [one.from_s for one in self.inputs]
-        if any(b <= a for a, b in zip(times, times[1:], strict=False)):
+        if any(b <= a for a, b in itertools.pairwise(times)):
             raise ValueError(f"inputs: from_s must increase from one to the next, got {times}")
         return self
 
@@ -142,7 +143,7 @@ def advance_open_loop(
 
 def _row(t_s: float, motion: Motion, d_mm: float) -> list[float]:
     sin, cos = math.sin(motion.theta), math.cos(motion.theta)
-    x_mm, y_mm = axle_midpoint.py_func(motion, d_mm)
+    x_mm, y_mm = motion.x - d_mm * sin, motion.y + d_mm * cos
     return [
         t_s,
         x_mm,
@@ -186,9 +187,7 @@ def run_open_loop(
 
     rows = [_row(0.0, Motion(*motions[:, 0, 0].tolist()), robot.com_offset_mm)]
     for first in range(0, steps - steps % per_row, per_row):
-        advance_open_loop(
-            bodies, motions, contacts, torques[first : first + per_row], push, dt_s
-        )
+        advance_open_loop(bodies, motions, contacts, torques[first : first + per_row], push, dt_s)
         t_s = (first + per_row) * dt_s
         rows.append(_row(t_s, Motion(*motions[:, 0, 0].tolist()), robot.com_offset_mm))
     return np.array(rows)
@@ -209,7 +208,9 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
     except (json.JSONDecodeError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
     if not isinstance(data, dict) or not data:
-        raise ValueError(f"{path} must hold an object of named scenarios, got {type(data).__name__}")
+        raise ValueError(
+            f"{path} must hold an object of named scenarios, got {type(data).__name__}"
+        )
     for name in data:
         if not name or Path(name).name != name or name.startswith("."):
             raise ValueError(f"{path}: the scenario name {name!r} cannot be a file name")
@@ -218,3 +219,10 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
     except ValidationError as error:
         raise ValueError(f"{path}: {one_line(error)}") from error
 
+
+def write_rows(path: Path, rows: np.ndarray) -> Path:
+    """Write the rows of a run as CSV with the header :data:`COLUMNS`, atomically."""
+    with atomic(path, encoding="utf-8") as file:
+        file.write(",".join(COLUMNS) + "\n")
+        np.savetxt(file, rows, fmt="%.12g", delimiter=",")
+    return path

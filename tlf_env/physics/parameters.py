@@ -59,7 +59,9 @@ class JointFriction(FrictionCurve):
     bending: bool = True  # Table I: bending moment on
 
 
-def _joint(mu_static: float, mu_dynamic: float, arms_mm: tuple[float, float, float]) -> JointFriction:
+def _joint(
+    mu_static: float, mu_dynamic: float, arms_mm: tuple[float, float, float]
+) -> JointFriction:
     friction_arm_mm, pin_radius_mm, bending_arm_mm = arms_mm
     return JointFriction(
         mu_static=mu_static,
@@ -176,6 +178,14 @@ class Body(NamedTuple):
     w_ef: float
     spin_drive: float  # R²/J
     spin_castor: float  # R_c²/J_c
+    spin_mass_drive: float  # J/R²
+    spin_mass_castor: float  # J_c/R_c²
+    I_rolling: float  # about c, with the drive wheels' spins: I + m d² + 2 J h²/R²
+    inverse_m: float
+    inverse_I: float
+    inverse_I_s: float
+    inverse_J: float
+    inverse_J_c: float
     torque_limit: float
     outline_radius: float
     outline_ahead: float  # centre of the outline ahead of the centre of mass
@@ -230,6 +240,7 @@ def body(p: RobotParameters) -> Body:
     """Kernel constants of one robot."""
     half_mm = p.axle_width_mm / 2
     weight_mN = p.mass_kg * p.gravity_mm_s2
+    spin_mass = p.wheel_inertia_kg_mm2 / p.wheel_radius_mm**2
     inverse_m, inverse_I = 1 / p.mass_kg, 1 / p.body_inertia_kg_mm2
     return Body(
         p.mass_kg,
@@ -250,6 +261,14 @@ def body(p: RobotParameters) -> Body:
         p.com_offset_mm * half_mm * inverse_I,
         p.wheel_radius_mm**2 / p.wheel_inertia_kg_mm2,
         p.castor_radius_mm**2 / p.castor_inertia_kg_mm2,
+        spin_mass,
+        p.castor_inertia_kg_mm2 / p.castor_radius_mm**2,
+        p.body_inertia_kg_mm2 + p.mass_kg * p.com_offset_mm**2 + 2 * spin_mass * half_mm**2,
+        inverse_m,
+        inverse_I,
+        1 / p.fork_inertia_kg_mm2,
+        1 / p.wheel_inertia_kg_mm2,
+        1 / p.castor_inertia_kg_mm2,
         p.torque_limit_Nmm * MILLINEWTON_PER_NEWTON,
         p.outline_radius_mm,
         p.com_offset_mm - p.outline_offset_mm,

@@ -12,8 +12,8 @@ from typing import Any
 import numpy as np
 import pymunk
 
-from tlf_env.physics.kernel import Motion
 from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.state import Motion
 
 ITERATIONS = 20
 COLLISION_SLOP_MM = 0.1
@@ -64,7 +64,8 @@ class PymunkPlant:
     def space(self, motions: np.ndarray) -> pymunk.Space:
         """The space with its bodies where ``motions`` (field, robot, 1) has them, for drawing and queries."""
         self._write(motions, motions)
-        self._space.reindex_shapes()
+        for body in self._bodies:
+            self._space.reindex_shapes_for_body(body)
         return self._space
 
     def _write(self, poses: np.ndarray, velocities: np.ndarray) -> None:

@@ -10,8 +10,8 @@ from tlf_env.numerics.compiled import reader, writer
 from tlf_env.onboard.estimator import Ekf, Estimate, ekf_constants
 from tlf_env.onboard.observer import Message, Reference
 from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState, digital_wheel_loop
-from tlf_env.physics.kernel import Contact, Motion
 from tlf_env.physics.parameters import body_array
+from tlf_env.physics.state import Contact, Motion
 from tlf_env.task.disturbance import Effects, constant_effects
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.observation import tracking_entries

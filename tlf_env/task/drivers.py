@@ -26,7 +26,13 @@ from tlf_env.onboard.estimator import (
     read_estimate,
     write_estimate,
 )
-from tlf_env.onboard.observer import Message, Reference, observed_reference, observer_rates, smoothing
+from tlf_env.onboard.observer import (
+    Message,
+    Reference,
+    observed_reference,
+    observer_rates,
+    smoothing,
+)
 from tlf_env.onboard.tracking import body_errors
 from tlf_env.onboard.wheel_loop import (
     WheelLoop,
@@ -36,7 +42,10 @@ from tlf_env.onboard.wheel_loop import (
     wheel_torque,
     write_loop_state,
 )
-from tlf_env.physics.kernel import (
+from tlf_env.physics.kernel import substep
+from tlf_env.physics.kinematics import follow_wheels
+from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Body
+from tlf_env.physics.state import (
     Contact,
     Floor,
     Motion,
@@ -47,12 +56,9 @@ from tlf_env.physics.kernel import (
     read_body,
     read_contact,
     read_motion,
-    substep,
     write_contact,
     write_motion,
 )
-from tlf_env.physics.kinematics import follow_wheels
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Body
 from tlf_env.task.arrays import (
     Arrays,
     Info,
@@ -74,7 +80,6 @@ TWIST, WHEEL_SPEED = 0, 1
 FULL_SPEED_MM_S = 1000.0
 FULL_YAW_RATE_RAD_S = 8.0
 FULL_WHEEL_SPEED_RAD_S = 25.0
-
 
 
 class Settings(NamedTuple):
@@ -128,7 +133,9 @@ def actuate_robot(
 ) -> tuple[Motion, Contact, WheelLoopState, Trace]:
     """Wheel loop, torques, disturbances and plant for one substep of one robot."""
     if kinematic:
-        moved = follow_wheels(body, motion, wanted_l, wanted_r, effects.delta_1, effects.delta_2, dt)
+        moved = follow_wheels(
+            body, motion, wanted_l, wanted_r, effects.delta_1, effects.delta_2, dt
+        )
         return moved, contact, held, trace
     limit = body.torque_limit
     torque_l, integral_l, lag_l = wheel_torque(
@@ -339,9 +346,7 @@ def wanted_of_formation(a: Arrays, lane: int, r: int, step: int, gap: int) -> tu
 
 
 @block
-def next_reference(
-    a: Arrays, lane: int, r: int, m: int, s: Settings
-) -> None:
+def next_reference(a: Arrays, lane: int, r: int, m: int, s: Settings) -> None:
     """Put the reference of control step ``m`` into the ring and move the follower's observer on."""
     slot = m % a.references.shape[1]
     if r == 0:
@@ -407,9 +412,7 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     estimate = read_estimate(a.estimates, r, lane)
     reference = read_reference(a, lane, r, step)
     trace = read_trace(a.traces, r, lane)
-    e_1, e_2 = body_errors(
-        reference.x - estimate.x, reference.y - estimate.y, estimate.theta
-    )
+    e_1, e_2 = body_errors(reference.x - estimate.x, reference.y - estimate.y, estimate.theta)
     e_3 = reference.theta - estimate.theta
     sin_e3, cos_e3 = math.sin(e_3), math.cos(e_3)
     per_substep = 1.0 / s.substeps
@@ -449,9 +452,7 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
 
 
 @block
-def judge_robot(
-    a: Arrays, lane: int, r: int, step: int, s: Settings
-) -> None:
+def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     """Write the true errors, the reward terms and whether one robot is lost."""
     motion = read_motion(a.motions, r, lane)
     d = a.bodies[BODY_D, r, lane]

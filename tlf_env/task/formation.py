@@ -7,11 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 import pymunk
 
-from tlf_env.physics.kernel import Motion
-from tlf_env.physics.parameters import RobotParameters
 from tlf_env.physics.pymunk_plant import PymunkPlant
+from tlf_env.physics.state import Motion
 from tlf_env.task import drivers
-from tlf_env.task.arrays import Arrays, State, make_arrays
+from tlf_env.task.arrays import Arrays, make_arrays
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.trajectories import sample
@@ -26,7 +25,9 @@ def reference_table(scenario: Scenario) -> np.ndarray:
 
 
 # What each entry of State is divided by in the interface.
-STATE_SCALES = np.array([1000.0, 1000.0, 1.0, 1.0, 1.0, 500.0, 500.0, 2.0, 10.0, 10.0, 1000.0, 1000.0])
+STATE_SCALES = np.array(
+    [1000.0, 1000.0, 1.0, 1.0, 1.0, 500.0, 500.0, 2.0, 10.0, 10.0, 1000.0, 1000.0]
+)
 
 
 class Formation:
@@ -145,7 +146,7 @@ def state_rows(a: Arrays) -> np.ndarray:
     d = a.bodies[drivers.BODY_D, :, 0]
     sin, cos = np.sin(m.theta), np.cos(m.theta)
     slot = a.clock[0, 1] % a.references.shape[1]
-    rows = State(
+    rows = [
         m.x - d * sin,
         m.y + d * cos,
         sin,
@@ -158,5 +159,5 @@ def state_rows(a: Arrays) -> np.ndarray:
         m.omega_r,
         a.references[0, slot, :, 0],
         a.references[1, slot, :, 0],
-    )
+    ]
     return np.stack(rows, axis=-1)

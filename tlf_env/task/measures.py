@@ -55,9 +55,7 @@ def time_gap_error(
     a = first % slots
     for k in range(first, last):
         b = a + 1 if a + 1 < slots else 0
-        fraction, squared = nearest_on_segment(
-            x, y, path[0, a], path[1, a], path[0, b], path[1, b]
-        )
+        fraction, squared = nearest_on_segment(x, y, path[0, a], path[1, a], path[0, b], path[1, b])
         if squared < best:
             best, best_step = squared, k + fraction
         a = b

@@ -5,8 +5,6 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
 from tlf_env.onboard.observer import Reference

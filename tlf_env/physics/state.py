@@ -1,0 +1,114 @@
+"""A robot's state as the kernel sees it. Units: mm, kg, s, rad; forces mN, impulses mN·s and mN·mm·s."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.physics.parameters import Body
+
+
+class Motion(NamedTuple):
+    """Pose and velocities of the five bodies."""
+
+    x: float  # centre of mass, mm
+    y: float
+    theta: float  # heading, rad, counter-clockwise from +y, not wrapped
+    psi: float  # fork angle in the world, rad; castor angle φ = ψ − θ
+    v_x: float  # velocity of the centre of mass, mm/s
+    v_y: float
+    w: float  # yaw rate, rad/s
+    s: float  # fork rate ψ̇, rad/s
+    omega_l: float  # spins, rad/s
+    omega_r: float
+    omega_c: float
+    angle_l: float  # drive wheels' angles, rad
+    angle_r: float
+
+
+class Contact(NamedTuple):
+    """The solver's memory, part of the state: last impulses, and slip speeds."""
+
+    p_le: float  # tyre impulses, mN·s
+    p_lf: float
+    p_re: float
+    p_rf: float
+    p_cx: float  # castor, ⊥ to the fork
+    p_cy: float  # castor, ∥ to the fork
+    q_l: float  # joint friction impulses, mN·mm·s
+    q_r: float
+    q_c: float
+    q_s: float  # steering
+    slip_l: float  # slip speeds |v| at the floor, mm/s
+    slip_r: float
+    slip_c: float
+
+
+class Rates(NamedTuple):
+    """Velocities in body axes: e to the right, f forward (mm/s, rad/s)."""
+
+    v_e: float
+    v_f: float
+    w: float
+    s: float
+    omega_l: float
+    omega_r: float
+    omega_c: float
+
+
+class Floor(NamedTuple):
+    """What the floor does to one robot during one substep."""
+
+    conveyor_l: float  # σ_l, σ_r: injected slip of eq. (14) as conveyor speeds, mm/s
+    conveyor_r: float
+    grip_l: float  # factors on the tyres' friction
+    grip_r: float
+    grip_c: float
+
+
+class Push(NamedTuple):
+    """External force at the centre of mass in world axes (mN) and torque (mN·mm)."""
+
+    f_x: float
+    f_y: float
+    torque: float
+
+
+read_body = reader(Body)
+read_motion = reader(Motion)
+write_motion = writer(Motion)
+read_contact = reader(Contact)
+write_contact = writer(Contact)
+
+
+@law
+def conveyor(delta_1: float, delta_2: float, half_width: float) -> tuple[float, float]:
+    """Conveyor speeds (left, right; mm/s) that inject the slip δ₁ (mm/s), δ₂ (rad/s) of eq. (14)."""
+    return delta_1 - delta_2 * half_width, delta_1 + delta_2 * half_width
+
+
+@law
+def advance_pose(motion: Motion, dt: float) -> Motion:
+    """Pose one substep on, added up exactly as Chipmunk does: p + v·dt, θ + w·dt."""
+    return Motion(
+        motion.x + motion.v_x * dt,
+        motion.y + motion.v_y * dt,
+        motion.theta + motion.w * dt,
+        motion.psi,
+        motion.v_x,
+        motion.v_y,
+        motion.w,
+        motion.s,
+        motion.omega_l,
+        motion.omega_r,
+        motion.omega_c,
+        motion.angle_l,
+        motion.angle_r,
+    )
+
+
+@law
+def axle_midpoint(motion: Motion, d: float) -> tuple[float, float]:
+    """Position of c, mm: the centre of mass lies ``d`` behind it."""
+    return motion.x - d * math.sin(motion.theta), motion.y + d * math.cos(motion.theta)
