@@ -7,23 +7,17 @@ from typing import Any
 import numpy as np
 
 from tlf_env.numerics.compiled import driver
-from tlf_env.onboard.tracking import TrackingGains, gains_row, tracking_gains, tracking_twist
-from tlf_env.task.drivers import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
+from tlf_env.onboard.tracking import Gains, TrackingGains, gains_row, tracking_gains
+from tlf_env.task.actions import ACTION_SIZE, reference_action
 from tlf_env.task.observation import TRACKING_ENTRIES, Tracking
 
-READ = ("e_1", "e_2", "sin_e_3", "cos_e_3", "reference_u_1", "reference_u_2")
-COLUMNS = np.array([Tracking._fields.index(name) for name in READ])
-SCALES = np.array([TRACKING_ENTRIES[name].scale for name in READ])
+SCALES = np.array([entry.scale for entry in TRACKING_ENTRIES.values()])
 
 
 @driver
-def _twists(rows: np.ndarray, gains: Any, out: np.ndarray) -> None:
+def _actions(rows: np.ndarray, scales: np.ndarray, gains: Gains, out: np.ndarray) -> None:
     for i in range(rows.shape[0]):
-        u_1, u_2 = tracking_twist(
-            rows[i, 0], rows[i, 1], rows[i, 2], rows[i, 3], rows[i, 4], rows[i, 5], gains
-        )
-        out[i, 0] = u_1 / FULL_SPEED_MM_S
-        out[i, 1] = u_2 / FULL_YAW_RATE_RAD_S
+        out[i, 0], out[i, 1] = reference_action(rows[i], scales, gains)
 
 
 class ReferencePolicy:
@@ -55,7 +49,7 @@ class ReferencePolicy:
     ) -> tuple[np.ndarray, Any]:
         """Action for one ``tracking`` observation ``(entry,)`` or a batch ``(batch, entry)``.
 
-        Returns the action, float32 within [−1, 1], and ``state`` unchanged: the law has no memory.
+        Returns the action, in the observation's dtype and within [−1, 1], and ``state`` unchanged: the law has no memory.
 
         Raises
         ------
@@ -68,8 +62,7 @@ class ReferencePolicy:
                 f"the observation has the shape {observation.shape}; a tracking observation has at "
                 f"least {len(Tracking._fields)} entries, in one row or a batch of rows"
             )
-        rows = np.atleast_2d(observation)[:, COLUMNS] * SCALES
-        action = np.empty((len(rows), 2))
-        _twists(rows, self._row, action)
-        action = np.clip(action, -1.0, 1.0).astype(np.float32)
+        rows = np.ascontiguousarray(np.atleast_2d(observation))
+        action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
+        _actions(rows, SCALES, self._row, action)
         return (action[0] if observation.ndim == 1 else action), state

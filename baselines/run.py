@@ -126,7 +126,7 @@ def run_policy(
     """
     env = parallel_env(scenario.model_copy(update={"end_on": ()}))
     observations, _ = env.reset(seed=seed)
-    n, steps = scenario.robots, scenario.horizon_steps
+    n, steps = scenario.robot_count, scenario.horizon_steps
     rows = {name: np.zeros((steps + 1, n)) for name in RECORDED}
     _note(env, rows, 0)
     state: Any = None
@@ -162,8 +162,8 @@ def _note(env: FormationParallelEnv, rows: dict[str, np.ndarray], k: int) -> Non
     rows["castor_rad"][k] = motion.psi - motion.theta
     rows["omega_l_rad_s"][k] = motion.omega_l
     rows["omega_r_rad_s"][k] = motion.omega_r
-    rows["omega_l_command_rad_s"][k] = a.commands[0, :, 0]
-    rows["omega_r_command_rad_s"][k] = a.commands[1, :, 0]
+    rows["omega_l_command_rad_s"][k] = a.wanted[0, :, 0]
+    rows["omega_r_command_rad_s"][k] = a.wanted[1, :, 0]
 
 
 def _with_functionals(rows: dict[str, np.ndarray], period_s: float) -> dict[str, np.ndarray]:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
+import gymnasium
 import pettingzoo
 
 if TYPE_CHECKING:
@@ -43,4 +44,9 @@ for _task in ("infinity", "flower"):
     )
     pettingzoo.register(
         "aec", f"tlf_env/{_task}-v0", "tlf_env.envs.parallel:aec_env", kwargs={"scenario": _task}
+    )
+    gymnasium.register(
+        f"tlf_env/{_task.capitalize()}-v0",
+        "tlf_env.envs.single:FormationEnv",
+        kwargs={"scenario": _task},
     )

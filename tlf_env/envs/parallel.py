@@ -14,14 +14,17 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from tlf_env.numerics.philox import MAX_SEED
-from tlf_env.task.arrays import ACTION_SIZE, Info, State
+from tlf_env.onboard.parts import Factory, part_name
+from tlf_env.task.actions import ACTION_SIZE
+from tlf_env.task.arrays import Info, State
 from tlf_env.task.disturbance import constant_effects
 from tlf_env.task.formation import STATE_SCALES, Formation
-from tlf_env.task.observation import OBSERVATION_LIMIT, tracking_entries
+from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario, load_scenario
 
 Agent = str
+RENDER_MODES = ["human", "rgb_array"]
 PETTINGZOO_TEST_OPTION = "options"  # what PettingZoo's own API test passes; means nothing
 
 
@@ -53,7 +56,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     scenario
         A preset's name, a YAML file, a mapping or a :class:`~tlf_env.task.scenario.Scenario`.
     render_mode
-        None.
+        None, ``"rgb_array"`` or ``"human"``.
     **overrides
         Fields of the scenario; ``disturbance_level`` too.
 
@@ -70,34 +73,38 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         **overrides: Any,
     ) -> None:
+        overrides, parts = separate_parts(overrides)
         self.scenario = load_scenario(scenario, **overrides)
         self.metadata = {
             "name": f"tlf_env/{self.scenario.name}-v0",
-            "render_modes": [],
+            "render_modes": RENDER_MODES,
             "is_parallelizable": True,
             "render_fps": 1 / self.scenario.control_period_s,
         }
-        if render_mode is not None:
-            raise ValueError(f"render_mode {render_mode!r} is not one of: None")
+        if render_mode not in (None, *RENDER_MODES):
+            raise ValueError(
+                f"render_mode {render_mode!r} is not one of {', '.join(RENDER_MODES)}, None"
+            )
         self.render_mode = render_mode
-        self.possible_agents = [f"robot_{i}" for i in range(self.scenario.robots)]
+        self.possible_agents = [f"robot_{i}" for i in range(self.scenario.robot_count)]
         self.agents: list[Agent] = []
-        entries = len(tracking_entries(self.scenario.preview_s))
+        self._formation = Formation(self.scenario, parts)
+        dtype = np.dtype(self.scenario.dtype)
         self.observation_spaces = {
             agent: gymnasium.spaces.Box(
-                -OBSERVATION_LIMIT, OBSERVATION_LIMIT, (entries,), np.float32
+                -OBSERVATION_LIMIT, OBSERVATION_LIMIT, self._seen().shape[1:], dtype.type
             )
             for agent in self.possible_agents
         }
         self.action_spaces = {
-            agent: gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), np.float32)
+            agent: gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), dtype.type)
             for agent in self.possible_agents
         }
         self.state_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (len(self.possible_agents) * len(State._fields),), np.float32
         )
-        self._formation = Formation(self.scenario)
         self._effects = constant_effects(self.scenario.disturbance)._asdict()
+        self._renderer: Any = None
         self._seed: int | None = None
         self._episode = 0
 
@@ -130,23 +137,22 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             0 to 2⁶³ − 1. The same seed gives the same episode, bit for bit. Without one the next
             episode of the last seed begins, or of a random one where there was none.
         options
-            None are known.
+            ``poses``: start poses of c, ``(robot, 3)`` in mm, mm, rad (at rest); ``phase_s``: the
+            leader's reference starts that much later on its trajectory.
 
         Raises
         ------
         ValueError
-            for a seed out of its range or an unknown option.
+            for a seed out of its range, an unknown option or an impossible value of one.
         """
-        unknown = sorted(set(options or {}) - {PETTINGZOO_TEST_OPTION})
-        if unknown:
-            raise ValueError(f"reset option {unknown[0]!r} is unknown; there are none")
+        poses, phase_s = start_options(options or {}, self.scenario.robot_count)
         if seed is not None:
             self._seed, self._episode = checked_seed(seed), 0
         elif self._seed is None:
             self._seed, self._episode = secrets.randbelow(MAX_SEED), 0
         else:
             self._episode += 1
-        self._formation.reset(self._seed, self._episode)
+        self._formation.reset(self._seed, self._episode, poses, phase_s)
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos()
 
@@ -228,8 +234,13 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             ends = {agent: ends.get(agent, rest) for agent in self.agents}
         return terminated, truncated, ends
 
+    def _seen(self) -> np.ndarray:
+        a = self._formation.arrays
+        sensor = self.scenario.observation == "sensor"
+        return a.sensor_observations[0] if sensor else a.observations[0]
+
     def _observations(self) -> dict[Agent, np.ndarray]:
-        fresh = self._formation.arrays.observations[0].copy()
+        fresh = self._seen().copy()
         return dict(zip(self.possible_agents, fresh, strict=True))
 
     def _infos(self) -> dict[Agent, dict[str, Any]]:
@@ -254,11 +265,75 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         """The truth for critics, float32: :class:`tlf_env.task.arrays.State` of every robot, scaled."""
         return (self._formation.state() / STATE_SCALES).astype(np.float32).ravel()
 
-    def render(self) -> None:
-        """Nothing: there is no render mode."""
+    def render(self) -> np.ndarray | None:
+        """A frame ``(height, width, 3)`` uint8 in mode ``rgb_array``; None in mode ``human``.
+
+        Raises
+        ------
+        RuntimeError
+            before the first :meth:`reset`, or if the environment was made without a render mode.
+        """
+        if self.render_mode is None or self._seed is None:
+            raise RuntimeError("render() needs a render_mode and a reset() before")
+        from tlf_env.envs.rendering import Renderer, scene_of
+
+        if self._renderer is None:
+            self._renderer = Renderer(
+                self.scenario.robot_models,
+                self._formation.arrays.table[:, :2],
+                mode=self.render_mode,
+                fps=self.metadata["render_fps"],
+            )
+        return self._renderer.draw(scene_of(self._formation))
 
     def close(self) -> None:
-        """Nothing to release."""
+        """Close the window, if there is one."""
+        if self._renderer is not None:
+            self._renderer.close()
+            self._renderer = None
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_renderer": None}
+
+
+def separate_parts(overrides: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Factory]]:
+    """Parts given as objects: the scenario gets their names, the formation the factories."""
+    parts = {
+        role: overrides[role]
+        for role in ("estimator", "wheel_loop", "observer")
+        if callable(overrides.get(role))
+    }
+    return {**overrides, **{role: part_name(part) for role, part in parts.items()}}, parts
+
+
+def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | None, float]:
+    """The start poses, if given, and the phase (s) of ``reset``'s options.
+
+    Raises
+    ------
+    ValueError
+        for an unknown option or an impossible value.
+    """
+    unknown = sorted(set(options) - {"poses", "phase_s", PETTINGZOO_TEST_OPTION})
+    if unknown:
+        raise ValueError(f"reset option {unknown[0]!r} is unknown; there are poses, phase_s")
+    phase_s = options.get("phase_s", 0.0)
+    if not isinstance(phase_s, int | float) or not np.isfinite(phase_s):
+        raise ValueError(
+            f"reset option phase_s must be a finite number of seconds, got {phase_s!r}"
+        )
+    if "poses" not in options:
+        return None, float(phase_s)
+    try:
+        poses = np.asarray(options["poses"], dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"reset option poses must be numbers: {error}") from error
+    if poses.shape != (robots, 3) or not np.isfinite(poses).all():
+        raise ValueError(
+            f"reset option poses must be {robots} finite rows (x mm, y mm, θ rad), "
+            f"got the shape {poses.shape}: {options['poses']!r}"
+        )
+    return poses, float(phase_s)
 
 
 def checked_seed(seed: int) -> int:

@@ -7,18 +7,17 @@ from typing import NamedTuple
 import numpy as np
 
 from tlf_env.numerics.compiled import reader, writer
-from tlf_env.onboard.estimator import Ekf, Estimate, ekf_constants
+from tlf_env.onboard.estimator import Estimate, ekf_constants
 from tlf_env.onboard.observer import Message, Reference
-from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState, digital_wheel_loop
+from tlf_env.onboard.wheel_loop import WheelLoopParameters, WheelLoopState, digital_wheel_loop
 from tlf_env.physics.parameters import body_array
 from tlf_env.physics.state import Contact, Motion
+from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
 from tlf_env.task.disturbance import Effects, constant_effects
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
-from tlf_env.task.observation import tracking_entries
+from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario
-
-ACTION_SIZE = 2
 
 
 class Sensors(NamedTuple):
@@ -42,6 +41,15 @@ class Trace(NamedTuple):
     torque_r: float
     saturated: float  # substeps with a torque at its limit
     slip: float  # largest slip speed of a drive wheel, mm/s
+
+
+class Sample(NamedTuple):
+    """One substep's readings: position fix (mm) and the wheels' angle increments (rad)."""
+
+    fix_x: float
+    fix_y: float
+    step_l: float
+    step_r: float
 
 
 class Info(NamedTuple):
@@ -99,7 +107,10 @@ class Arrays(NamedTuple):
     sensors: np.ndarray
     estimates: np.ndarray
     traces: np.ndarray
-    commands: np.ndarray  # wheel speeds asked for, rad/s
+    kinds: np.ndarray  # (robot, lane) int64: of each robot's action
+    wanted: np.ndarray  # wheel speeds asked for (rad/s), or torques (mN·mm)
+    commands: np.ndarray  # the same, or the torques (mN·mm) of a wheel loop outside
+    samples: np.ndarray  # (substep, Sample, robot, lane): what the sensors said in a control step
     # on board, every control step
     messages: np.ndarray  # (Message, slot, robot, lane): ring over one gap
     observers: np.ndarray  # (x y θ, robot, lane)
@@ -112,7 +123,12 @@ class Arrays(NamedTuple):
     # interface, formations first
     actions: np.ndarray  # (lane, robot, 2)
     last_actions: np.ndarray
-    observations: np.ndarray  # (lane, robot, entry) float32
+    base_actions: np.ndarray  # (lane, robot, 2): what a residual is added to, in the actions' dtype
+    observations: np.ndarray  # (lane, robot, entry): `tracking`
+    sensor_observations: (
+        np.ndarray
+    )  # (lane, robot, entry): `sensor`, without entries if not asked for
+    starts: np.ndarray  # (x y θ, robot, lane): pose of c at the start
     terms: np.ndarray  # (lane, robot, RewardTerms)
     rewards: np.ndarray  # (lane, robot)
     infos: np.ndarray  # (lane, robot, Info)
@@ -120,7 +136,8 @@ class Arrays(NamedTuple):
     touched: np.ndarray
     lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
     touched_now: np.ndarray
-    scales: np.ndarray  # (entry,)
+    scales: np.ndarray  # (entry,) of `tracking`
+    sensor_scales: np.ndarray  # (entry,) of `sensor`
     weights: np.ndarray  # (RewardTerms,)
     previews: np.ndarray  # (preview,) int64, in control steps
 
@@ -130,6 +147,7 @@ read_sensors = reader(Sensors)
 write_sensors = writer(Sensors)
 read_trace = reader(Trace)
 write_trace = writer(Trace)
+write_sample = writer(Sample)
 
 
 def _constant(row: tuple[float, ...], robots: int, lanes: int) -> np.ndarray:
@@ -140,7 +158,12 @@ def _constant(row: tuple[float, ...], robots: int, lanes: int) -> np.ndarray:
 
 def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays:
     """Arrays of ``lanes`` formations, not yet reset."""
-    n = scenario.robots
+    n = scenario.robot_count
+    wheel_loop = scenario.wheel_loop
+    if isinstance(wheel_loop, str):  # an object outside; the arrays' own loop rests
+        wheel_loop = WheelLoopParameters()
+    dtype = np.dtype(scenario.dtype)
+    sensor = len(sensor_entries(scenario.substeps)) if scenario.observation == "sensor" else 0
     gap = scenario.gap_steps
     window = round(TIME_GAP_WINDOW_S / scenario.control_period_s)
     lookahead = max(scenario.preview_steps, default=0)
@@ -150,20 +173,21 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         return np.zeros((fields, n, lanes))
 
     return Arrays(
-        bodies=body_array([scenario.robot] * n, lanes),
-        wheel_loops=_constant(
-            digital_wheel_loop(scenario.wheel_loop, scenario.physics_period_s), n, lanes
-        ),
+        bodies=body_array(list(scenario.robot_models), lanes),
+        wheel_loops=_constant(digital_wheel_loop(wheel_loop, scenario.physics_period_s), n, lanes),
         ekfs=_constant(ekf_constants(scenario.ekf), n, lanes),
         effects=_constant(constant_effects(scenario.disturbance), n, lanes),
-        table=table,
+        table=table.copy(),
         motions=zeros(len(Motion._fields)),
         contacts=zeros(len(Contact._fields)),
         loop_states=zeros(len(WheelLoopState._fields)),
         sensors=zeros(len(Sensors._fields)),
         estimates=zeros(len(Estimate._fields)),
         traces=zeros(len(Trace._fields)),
+        kinds=np.full((n, lanes), ACTION_KINDS[scenario.action], dtype=np.int64),
+        wanted=zeros(2),
         commands=zeros(2),
+        samples=np.zeros((scenario.substeps, len(Sample._fields), n, lanes)),
         messages=np.zeros((len(Message._fields), gap + 1, n, lanes)),
         observers=zeros(3),
         references=np.zeros((len(Reference._fields), lookahead + 1, n, lanes)),
@@ -172,7 +196,10 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         seeds=np.zeros(lanes, dtype=np.int64),
         actions=np.zeros((lanes, n, ACTION_SIZE)),
         last_actions=np.zeros((lanes, n, ACTION_SIZE)),
-        observations=np.zeros((lanes, n, entries), dtype=np.float32),
+        base_actions=np.zeros((lanes, n, ACTION_SIZE), dtype=dtype),
+        observations=np.zeros((lanes, n, entries), dtype=dtype),
+        sensor_observations=np.zeros((lanes, n, sensor), dtype=dtype),
+        starts=zeros(3),
         terms=np.zeros((lanes, n, len(RewardTerms._fields))),
         rewards=np.zeros((lanes, n)),
         infos=np.zeros((lanes, n, len(Info._fields))),
@@ -181,24 +208,9 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         lost_now=np.zeros((lanes, n), dtype=np.bool_),
         touched_now=np.zeros((lanes, n), dtype=np.bool_),
         scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
+        sensor_scales=np.array(
+            [entry.scale for entry in sensor_entries(scenario.substeps).values()]
+        ),
         weights=np.array([scenario.reward[name] for name in RewardTerms._fields]),
         previews=np.array(scenario.preview_steps, dtype=np.int64),
     )
-
-
-__all__ = [
-    "ACTION_SIZE",
-    "Arrays",
-    "Ekf",
-    "Info",
-    "Sensors",
-    "State",
-    "Trace",
-    "WheelLoop",
-    "make_arrays",
-    "read_effects",
-    "read_sensors",
-    "read_trace",
-    "write_sensors",
-    "write_trace",
-]

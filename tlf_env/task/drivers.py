@@ -33,7 +33,7 @@ from tlf_env.onboard.observer import (
     observer_rates,
     smoothing,
 )
-from tlf_env.onboard.tracking import body_errors
+from tlf_env.onboard.tracking import Gains, body_errors
 from tlf_env.onboard.wheel_loop import (
     WheelLoop,
     WheelLoopState,
@@ -59,33 +59,42 @@ from tlf_env.physics.state import (
     write_contact,
     write_motion,
 )
+from tlf_env.task.actions import (
+    FULL_RESIDUAL_MM_S,
+    FULL_RESIDUAL_RAD_S,
+    FULL_SPEED_MM_S,
+    FULL_TORQUE_NMM,
+    FULL_WHEEL_SPEED_RAD_S,
+    FULL_YAW_RATE_RAD_S,
+    RESIDUAL,
+    TORQUE,
+    WHEEL_SPEED,
+    reference_action,
+    wheel_speeds,
+)
 from tlf_env.task.arrays import (
     Arrays,
     Info,
+    Sample,
     Sensors,
     Trace,
     read_effects,
     read_sensors,
     read_trace,
+    write_sample,
     write_sensors,
     write_trace,
 )
 from tlf_env.task.channels import POSITION_NOISE
 from tlf_env.task.disturbance import Effects
 from tlf_env.task.measures import distance, time_gap_error
-from tlf_env.task.observation import Tracking, preview_entries, scaled
+from tlf_env.task.observation import SensorTail, Tracking, preview_entries, scaled
 from tlf_env.task.reward import reward_terms
-
-TWIST, WHEEL_SPEED = 0, 1
-FULL_SPEED_MM_S = 1000.0
-FULL_YAW_RATE_RAD_S = 8.0
-FULL_WHEEL_SPEED_RAD_S = 25.0
 
 
 class Settings(NamedTuple):
     """Numbers of a scenario that all robots share."""
 
-    kind: int  # of the action
     kinematic: bool
     substeps: int
     dt: float  # physics period, s
@@ -96,7 +105,15 @@ class Settings(NamedTuple):
     observer_gain: float  # 1/s
     smoothing: float  # s
     lost_beyond: float  # mm
+    estimator: int  # EKF, TRUTH or EXTERNAL
+    external_wheel_loop: bool
+    external_observer: bool
+    cooperative: bool  # every robot gets the formation's mean reward
+    base: Gains  # of the twist that a residual is added to
 
+
+EKF, TRUTH, EXTERNAL = range(3)
+EXTERNAL_TORQUE = 4  # stands for the kind of a robot whose wheel loop is an object outside
 
 DONE, MUST_COLLIDE = -1, -2
 # Outlines that could come closer than this within a control step are stepped through the space.
@@ -107,13 +124,25 @@ NO_PUSH = Push(0.0, 0.0, 0.0)
 
 
 @law
-def wheel_command(a_0: float, a_1: float, kind: int, body: Body) -> tuple[float, float]:
-    """Wheel speeds (left, right; rad/s) that an action in [−1, 1]² asks for; the inverse of eq. (1)."""
+def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
+    """What robot ``r``'s clipped action asks for: wheel speeds (rad/s), or torques (mN·mm)."""
+    a_0, a_1 = a.actions[lane, r, 0], a.actions[lane, r, 1]
+    kind = a.kinds[r, lane]
+    if kind == TORQUE:
+        full = FULL_TORQUE_NMM * MILLINEWTON_PER_NEWTON
+        return a_0 * full, a_1 * full
     if kind == WHEEL_SPEED:
         return a_0 * FULL_WHEEL_SPEED_RAD_S, a_1 * FULL_WHEEL_SPEED_RAD_S
-    forward = a_0 * FULL_SPEED_MM_S
-    turn = a_1 * FULL_YAW_RATE_RAD_S * body.h
-    return (forward - turn) / body.R, (forward + turn) / body.R
+    body = read_body(a.bodies, r, lane)
+    if kind == RESIDUAL:
+        base = a.base_actions[lane, r]
+        base[0], base[1] = reference_action(a.observations[lane, r], a.scales, s.base)
+        return wheel_speeds(
+            base[0] * FULL_SPEED_MM_S + a_0 * FULL_RESIDUAL_MM_S,
+            base[1] * FULL_YAW_RATE_RAD_S + a_1 * FULL_RESIDUAL_RAD_S,
+            body,
+        )
+    return wheel_speeds(a_0 * FULL_SPEED_MM_S, a_1 * FULL_YAW_RATE_RAD_S, body)
 
 
 @law
@@ -126,6 +155,7 @@ def actuate_robot(
     held: WheelLoopState,
     sensors: Sensors,
     trace: Trace,
+    kind: int,
     wanted_l: float,
     wanted_r: float,
     kinematic: bool,
@@ -138,12 +168,17 @@ def actuate_robot(
         )
         return moved, contact, held, trace
     limit = body.torque_limit
-    torque_l, integral_l, lag_l = wheel_torque(
-        wanted_l - sensors.speed_l, held.integral_l, held.lag_l, loop, limit
-    )
-    torque_r, integral_r, lag_r = wheel_torque(
-        wanted_r - sensors.speed_r, held.integral_r, held.lag_r, loop, limit
-    )
+    if kind == TORQUE or kind == EXTERNAL_TORQUE:
+        torque_l = min(max(wanted_l, -limit), limit)
+        torque_r = min(max(wanted_r, -limit), limit)
+    else:
+        torque_l, integral_l, lag_l = wheel_torque(
+            wanted_l - sensors.speed_l, held.integral_l, held.lag_l, loop, limit
+        )
+        torque_r, integral_r, lag_r = wheel_torque(
+            wanted_r - sensors.speed_r, held.integral_r, held.lag_r, loop, limit
+        )
+        held = WheelLoopState(integral_l, lag_l, integral_r, lag_r)
     belt_l, belt_r = conveyor(effects.delta_1, effects.delta_2, body.h)
     floor = Floor(belt_l, belt_r, effects.grip, effects.grip, effects.grip)
     motion, contact = substep(body, motion, contact, floor, NO_PUSH, torque_l, torque_r, dt)
@@ -151,7 +186,7 @@ def actuate_robot(
     return (
         advance_pose(motion, dt),
         contact,
-        WheelLoopState(integral_l, lag_l, integral_r, lag_r),
+        held,
         Trace(
             trace.distance,
             trace.turn,
@@ -179,9 +214,10 @@ def sense_robot(
     episode: int,
     robot: int,
     tick: int,
+    kind: int,
     dt: float,
-) -> tuple[Sensors, Estimate, Trace]:
-    """Encoders, position fix and EKF after substep ``tick`` of one robot."""
+) -> tuple[Sensors, Estimate, Trace, Sample]:
+    """Encoders, position fix and estimator (of the ``kind``) after substep ``tick`` of one robot."""
     step_l, step_r = motion.angle_l - sensors.encoder_l, motion.angle_r - sensors.encoder_r
     u_1, u_2 = odometry(step_l, step_r, body.R, body.h)
     x, y = axle_midpoint(motion, body.d)
@@ -189,7 +225,12 @@ def sense_robot(
         noise_x, noise_y = normal_pair(seed, POSITION_NOISE, robot, episode, tick)
         x += effects.fix_std * noise_x
         y += effects.fix_std * noise_y
-    estimate, d_x, d_y, nis = correct(predict(estimate, ekf, u_1, u_2), ekf, x, y)
+    d_x = d_y = nis = 0.0
+    if kind == EKF:
+        estimate, d_x, d_y, nis = correct(predict(estimate, ekf, u_1, u_2), ekf, x, y)
+    elif kind == TRUTH:
+        true_x, true_y = axle_midpoint(motion, body.d)
+        estimate = Estimate(true_x, true_y, motion.theta, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     forward, right = body_errors(d_x, d_y, estimate.theta)
     return (
         Sensors(motion.angle_l, motion.angle_r, step_l / dt, step_r / dt),
@@ -205,11 +246,12 @@ def sense_robot(
             trace.saturated,
             trace.slip,
         ),
+        Sample(x, y, step_l, step_r),
     )
 
 
 @block
-def take_actions(a: Arrays, kind: int) -> int:
+def take_actions(a: Arrays, s: Settings) -> int:
     """Clip the actions and turn them into commands; clears the traces.
 
     Returns ``DONE``, or lane · robots + robot of the first action that is not finite; then nothing changes.
@@ -227,16 +269,18 @@ def take_actions(a: Arrays, kind: int) -> int:
             if clipped:
                 a.infos[lane, r, CLIPPED] += 1.0
             a.actions[lane, r, 0], a.actions[lane, r, 1] = a_0, a_1
-            body = read_body(a.bodies, r, lane)
-            a.commands[0, r, lane], a.commands[1, r, lane] = wheel_command(a_0, a_1, kind, body)
+            a.wanted[0, r, lane], a.wanted[1, r, lane] = command(a, lane, r, s)
+            a.commands[0, r, lane] = a.wanted[0, r, lane]
+            a.commands[1, r, lane] = a.wanted[1, r, lane]
             a.lost_now[lane, r] = a.touched_now[lane, r] = False
     a.traces[:] = 0.0
     return DONE
 
 
 @block
-def advance(a: Arrays, lane: int, kinematic: bool, substeps: int, dt: float) -> None:
-    """Run ``substeps`` substeps of every robot of a lane, each by itself."""
+def advance(a: Arrays, lane: int, s: Settings) -> None:
+    """Run the substeps of a control step of every robot of a lane, each by itself."""
+    substeps, dt = s.substeps, s.dt
     seed, episode, first = a.seeds[lane], a.clock[lane, 2], a.clock[lane, 0]
     for r in range(a.motions.shape[1]):
         body = read_body(a.bodies, r, lane)
@@ -249,6 +293,7 @@ def advance(a: Arrays, lane: int, kinematic: bool, substeps: int, dt: float) -> 
         sensors = read_sensors(a.sensors, r, lane)
         estimate = read_estimate(a.estimates, r, lane)
         trace = read_trace(a.traces, r, lane)
+        kind = a.kinds[r, lane]
         wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
         for k in range(substeps):
             motion, contact, held, trace = actuate_robot(
@@ -260,12 +305,13 @@ def advance(a: Arrays, lane: int, kinematic: bool, substeps: int, dt: float) -> 
                 held,
                 sensors,
                 trace,
+                kind,
                 wanted_l,
                 wanted_r,
-                kinematic,
+                s.kinematic,
                 dt,
             )
-            sensors, estimate, trace = sense_robot(
+            sensors, estimate, trace, sample = sense_robot(
                 body,
                 ekf,
                 effects,
@@ -277,8 +323,10 @@ def advance(a: Arrays, lane: int, kinematic: bool, substeps: int, dt: float) -> 
                 episode,
                 r,
                 first + k + 1,
+                s.estimator,
                 dt,
             )
+            write_sample(a.samples[k], r, lane, sample)
         write_motion(a.motions, r, lane, motion)
         write_contact(a.contacts, r, lane, contact)
         write_loop_state(a.loop_states, r, lane, held)
@@ -289,9 +337,12 @@ def advance(a: Arrays, lane: int, kinematic: bool, substeps: int, dt: float) -> 
 
 
 @driver
-def actuate(a: Arrays, kinematic: bool, dt: float) -> None:
+def actuate(a: Arrays, s: Settings) -> None:
     """The first half of one substep of lane 0: everything up to the plant's new velocities and poses."""
     for r in range(a.motions.shape[1]):
+        kind = a.kinds[r, 0]
+        if s.external_wheel_loop and kind != TORQUE:
+            kind = EXTERNAL_TORQUE
         motion, contact, held, trace = actuate_robot(
             read_body(a.bodies, r, 0),
             read_wheel_loop(a.wheel_loops, r, 0),
@@ -301,10 +352,11 @@ def actuate(a: Arrays, kinematic: bool, dt: float) -> None:
             read_loop_state(a.loop_states, r, 0),
             read_sensors(a.sensors, r, 0),
             read_trace(a.traces, r, 0),
+            kind,
             a.commands[0, r, 0],
             a.commands[1, r, 0],
-            kinematic,
-            dt,
+            s.kinematic,
+            s.dt,
         )
         write_motion(a.motions, r, 0, motion)
         write_contact(a.contacts, r, 0, contact)
@@ -313,11 +365,11 @@ def actuate(a: Arrays, kinematic: bool, dt: float) -> None:
 
 
 @driver
-def sense(a: Arrays, dt: float) -> None:
-    """The second half of one substep of lane 0: sensors and EKF, and which outlines meet."""
+def sense(a: Arrays, k: int, s: Settings) -> None:
+    """The second half of substep ``k`` of lane 0: sensors and estimator, and which outlines meet."""
     tick = a.clock[0, 0] + 1
     for r in range(a.motions.shape[1]):
-        sensors, estimate, trace = sense_robot(
+        sensors, estimate, trace, sample = sense_robot(
             read_body(a.bodies, r, 0),
             read_ekf(a.ekfs, r, 0),
             read_effects(a.effects, r, 0),
@@ -329,8 +381,10 @@ def sense(a: Arrays, dt: float) -> None:
             a.clock[0, 2],
             r,
             tick,
-            dt,
+            s.estimator,
+            s.dt,
         )
+        write_sample(a.samples[k], r, 0, sample)
         write_sensors(a.sensors, r, 0, sensors)
         write_estimate(a.estimates, r, 0, estimate)
         write_trace(a.traces, r, 0, trace)
@@ -345,6 +399,19 @@ def wanted_of_formation(a: Arrays, lane: int, r: int, step: int, gap: int) -> tu
     return a.table[k, 0], a.table[k, 1]
 
 
+@law
+def delayed_message(a: Arrays, lane: int, r: int, step: int, gap: int) -> Message:
+    """What robot ``r``'s predecessor broadcast one gap before a control step; at first its start."""
+    old = max(step - gap, 0) % a.messages.shape[1]
+    return Message(
+        a.messages[0, old, r - 1, lane],
+        a.messages[1, old, r - 1, lane],
+        a.messages[2, old, r - 1, lane],
+        a.messages[3, old, r - 1, lane],
+        a.messages[4, old, r - 1, lane],
+    )
+
+
 @block
 def next_reference(a: Arrays, lane: int, r: int, m: int, s: Settings) -> None:
     """Put the reference of control step ``m`` into the ring and move the follower's observer on."""
@@ -353,14 +420,7 @@ def next_reference(a: Arrays, lane: int, r: int, m: int, s: Settings) -> None:
         for i in range(5):
             a.references[i, slot, r, lane] = a.table[m, i]
         return
-    old = max(m - s.gap, 0) % a.messages.shape[1]
-    delayed = Message(
-        a.messages[0, old, r - 1, lane],
-        a.messages[1, old, r - 1, lane],
-        a.messages[2, old, r - 1, lane],
-        a.messages[3, old, r - 1, lane],
-        a.messages[4, old, r - 1, lane],
-    )
+    delayed = delayed_message(a, lane, r, m, s.gap)
     x, y = a.observers[0, r, lane], a.observers[1, r, lane]
     theta = a.observers[2, r, lane]
     factor = smoothing(m * s.period, s.smoothing)
@@ -452,6 +512,44 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
 
 
 @block
+def observe_sensors(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
+    """Write the ``sensor`` observation of one robot."""
+    out = a.sensor_observations[lane, r]
+    start_x, start_y, start = a.starts[0, r, lane], a.starts[1, r, lane], a.starts[2, r, lane]
+    i = 0
+    for k in range(s.substeps):
+        for f in range(a.samples.shape[1]):
+            value = a.samples[k, f, r, lane] if step > 0 else 0.0
+            if step > 0 and f == 0:
+                value -= start_x
+            elif step > 0 and f == 1:
+                value -= start_y
+            out[i] = scaled(value, a.sensor_scales[i])
+            i += 1
+    if r == 0:
+        heard = read_reference(a, lane, r, step)
+    else:
+        delayed = delayed_message(a, lane, r, step, s.gap)
+        heard = Reference(delayed.x, delayed.y, delayed.theta, delayed.u_1, delayed.u_2)
+    tail = SensorTail(
+        step * s.period,
+        start_x,
+        start_y,
+        math.sin(start),
+        math.cos(start),
+        heard.x - start_x,
+        heard.y - start_y,
+        math.sin(heard.theta),
+        math.cos(heard.theta),
+        heard.u_1,
+        heard.u_2,
+        1.0 if r == 0 else 0.0,
+    )
+    for j in range(len(tail)):
+        out[i + j] = scaled(tail[j], a.sensor_scales[i + j])
+
+
+@block
 def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     """Write the true errors, the reward terms and whether one robot is lost."""
     motion = read_motion(a.motions, r, lane)
@@ -503,39 +601,82 @@ def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     a.rewards[lane, r] = total
 
 
+@block
+def transmit_lane(a: Arrays, lane: int, s: Settings) -> None:
+    """Count the control step; everybody broadcasts."""
+    step = a.clock[lane, 1] + 1
+    a.clock[lane, 1] = step
+    for r in range(a.motions.shape[1]):
+        broadcast(a, lane, r, step, s.period)
+        record_truth(a, lane, r, step)
+
+
+@block
+def look_lane(a: Arrays, lane: int, s: Settings) -> None:
+    """Errors, rewards and observations of a lane as it stands."""
+    robots = a.motions.shape[1]
+    step = a.clock[lane, 1]
+    for r in range(robots):
+        judge_robot(a, lane, r, step, s)
+        observe_robot(a, lane, r, step, s)
+        if a.sensor_observations.shape[2] > 0:
+            observe_sensors(a, lane, r, step, s)
+    if s.cooperative:
+        mean = a.rewards[lane].mean()
+        a.rewards[lane, :] = mean
+
+
 @driver
 def begin(a: Arrays, lane: int, s: Settings) -> None:
-    """After the poses of a lane are set: first messages, references up to the preview, observations."""
+    """After the poses of a lane are set: first messages, and references up to the preview."""
     robots = a.motions.shape[1]
     for r in range(robots):
         broadcast(a, lane, r, 0, s.period)
         record_truth(a, lane, r, 0)
     for r in range(robots):
-        for m in range(s.lookahead + 1):
-            next_reference(a, lane, r, m, s)
-        judge_robot(a, lane, r, 0, s)
-        observe_robot(a, lane, r, 0, s)
+        if r == 0 or not s.external_observer:
+            for m in range(s.lookahead + 1):
+                next_reference(a, lane, r, m, s)
 
 
 @block
 def conclude_lane(a: Arrays, lane: int, s: Settings) -> None:
     """After the substeps of a control step: radio, observers, errors, rewards and observations."""
-    robots = a.motions.shape[1]
-    step = a.clock[lane, 1] + 1
-    a.clock[lane, 1] = step
-    for r in range(robots):
-        broadcast(a, lane, r, step, s.period)
-        record_truth(a, lane, r, step)
-    for r in range(robots):
-        next_reference(a, lane, r, step + s.lookahead, s)
-        judge_robot(a, lane, r, step, s)
-        observe_robot(a, lane, r, step, s)
+    transmit_lane(a, lane, s)
+    for r in range(a.motions.shape[1]):
+        next_reference(a, lane, r, a.clock[lane, 1] + s.lookahead, s)
+    look_lane(a, lane, s)
 
 
 @driver
-def conclude(a: Arrays, s: Settings) -> None:
-    """:func:`conclude_lane` of lane 0, for a control step that went through the space."""
-    conclude_lane(a, 0, s)
+def transmit(a: Arrays, s: Settings) -> None:
+    """:func:`transmit_lane` of lane 0, and the leader's next reference."""
+    transmit_lane(a, 0, s)
+    next_reference(a, 0, 0, a.clock[0, 1] + s.lookahead, s)
+
+
+@driver
+def observe_followers(a: Arrays, s: Settings) -> None:
+    """The followers' next references in lane 0."""
+    for r in range(1, a.motions.shape[1]):
+        next_reference(a, 0, r, a.clock[0, 1] + s.lookahead, s)
+
+
+@driver
+def look(a: Arrays, s: Settings) -> None:
+    """:func:`look_lane` of lane 0."""
+    look_lane(a, 0, s)
+
+
+@driver
+def prepare(a: Arrays, s: Settings) -> int:
+    """Take the actions of lane 0; returns as :func:`control_step` does, ``MUST_COLLIDE`` if near."""
+    bad = take_actions(a, s)
+    if bad != DONE:
+        return bad
+    if not s.kinematic and not room_to_move(a, 0, s.period):
+        return MUST_COLLIDE
+    return DONE
 
 
 @driver
@@ -546,12 +687,12 @@ def control_step(a: Arrays, s: Settings) -> int:
     changed; or ``MUST_COLLIDE``: robots are close, actions are taken, and the substeps are left to
     the plant's space.
     """
-    bad = take_actions(a, s.kind)
+    bad = take_actions(a, s)
     if bad != DONE:
         return bad
     if not s.kinematic and not room_to_move(a, 0, s.period):
         return MUST_COLLIDE
-    advance(a, 0, s.kinematic, s.substeps, s.dt)
+    advance(a, 0, s)
     if s.kinematic:
         mark_touched(a, 0)
     conclude_lane(a, 0, s)

@@ -2,26 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 import pymunk
 
+from tlf_env.onboard.observer import ObserverParameters
+from tlf_env.onboard.parts import Factory
+from tlf_env.onboard.tracking import gains_row, tracking_gains
 from tlf_env.physics.pymunk_plant import PymunkPlant
 from tlf_env.physics.state import Motion
 from tlf_env.task import drivers
 from tlf_env.task.arrays import Arrays, make_arrays
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
+from tlf_env.task.parts import Parts, part_factories
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.trajectories import sample
 
-ACTION_KINDS = {"twist": drivers.TWIST, "wheel_speed": drivers.WHEEL_SPEED}
 
-
-def reference_table(scenario: Scenario) -> np.ndarray:
+def reference_table(scenario: Scenario, phase_s: float = 0.0) -> np.ndarray:
     """The leader's reference at every control step of an episode and of its preview, (step, 5)."""
     steps = scenario.horizon_steps + max(scenario.preview_steps, default=0) + 1
-    return sample(scenario.trajectory, np.arange(steps) * scenario.control_period_s)
+    return sample(scenario.trajectory, phase_s + np.arange(steps) * scenario.control_period_s)
 
 
 # What each entry of State is divided by in the interface.
@@ -33,26 +35,19 @@ STATE_SCALES = np.array(
 class Formation:
     """State of one formation on the ``pymunk`` or ``kinematic`` plant.
 
-    Units: mm, s, rad; arrays are views that the next step overwrites.
+    Units: mm, s, rad; arrays are views that the next step overwrites. ``parts`` gives factories for
+    the ``estimator``, ``wheel_loop`` or ``observer`` that the scenario names, where they are at hand
+    as objects; the rest is imported by name.
     """
 
-    def __init__(self, scenario: Scenario) -> None:
+    def __init__(self, scenario: Scenario, parts: Mapping[str, Factory] | None = None) -> None:
         self.scenario = scenario
-        self.arrays: Arrays = make_arrays(scenario, reference_table(scenario))
-        self.plant = PymunkPlant([scenario.robot] * scenario.robots)
-        self._settings = drivers.Settings(
-            kind=ACTION_KINDS[scenario.action],
-            kinematic=scenario.plant == "kinematic",
-            substeps=scenario.substeps,
-            dt=scenario.physics_period_s,
-            period=scenario.control_period_s,
-            gap=scenario.gap_steps,
-            lookahead=max(scenario.preview_steps, default=0),
-            window=round(TIME_GAP_WINDOW_S / scenario.control_period_s),
-            observer_gain=scenario.observer.gain_per_s,
-            smoothing=scenario.observer.smoothing_s,
-            lost_beyond=scenario.lost_beyond_mm,
-        )
+        self._table = reference_table(scenario)
+        self.arrays: Arrays = make_arrays(scenario, self._table)
+        self.plant = PymunkPlant(list(scenario.robot_models))
+        self._factories = part_factories(scenario, parts or {})
+        self._parts = Parts(self._factories, scenario)
+        self._settings = settings(scenario)
 
     @property
     def time_s(self) -> float:
@@ -69,28 +64,41 @@ class Formation:
         """The pymunk space with the bodies where they are now."""
         return self.plant.space(self.arrays.motions)
 
-    def reset(self, seed: int, episode: int = 0) -> None:
-        """Put all robots at their start, at rest, and take the first observation."""
+    def reset(
+        self,
+        seed: int,
+        episode: int = 0,
+        poses: np.ndarray | None = None,
+        phase_s: float = 0.0,
+    ) -> None:
+        """Put all robots at their start, at rest, and take the first observation.
+
+        ``poses`` ``(robot, 3)`` (mm, mm, rad) replaces the start poses of c; ``phase_s`` starts the
+        leader's reference that much later on its trajectory.
+        """
         a, s = self.arrays, self.scenario
         for state in (a.motions, a.contacts, a.loop_states, a.sensors, a.estimates, a.traces):
             state[:] = 0.0
-        for state in (a.actions, a.last_actions, a.infos):
+        for state in (a.actions, a.last_actions, a.infos, a.samples):
             state[:] = 0.0
         for flags in (a.lost, a.touched, a.lost_now, a.touched_now):
             flags[:] = False
         a.clock[0] = 0, 0, episode
         a.seeds[0] = seed
-        poses = start_poses(s, a.table[0])
-        for r, (x_mm, y_mm, theta) in enumerate(poses):
-            self._place(r, x_mm, y_mm, theta)
+        a.table[:] = reference_table(s, phase_s) if phase_s else self._table
+        for r, pose in enumerate(start_poses(s, a.table[0]) if poses is None else poses):
+            self._place(r, *pose)
         self.plant.reset()
         drivers.begin(a, 0, self._settings)
+        self._parts.reset(a, self._settings)
+        drivers.look(a, self._settings)
 
     def _place(self, r: int, x_mm: float, y_mm: float, theta: float) -> None:
-        a, d = self.arrays, self.scenario.robot.com_offset_mm
+        a, d = self.arrays, self.scenario.robot_models[r].com_offset_mm
         a.motions[:4, r, 0] = x_mm + d * np.sin(theta), y_mm - d * np.cos(theta), theta, theta
         a.estimates[:3, r, 0] = x_mm, y_mm, theta
         a.observers[:, r, 0] = x_mm, y_mm, theta
+        a.starts[:, r, 0] = x_mm, y_mm, theta
 
     def step(self) -> None:
         """Advance one control step with ``arrays.actions``.
@@ -100,27 +108,63 @@ class Formation:
         ValueError
             for an action that is not finite, naming the robot; then nothing has changed.
         """
-        a = self.arrays
-        result = drivers.control_step(a, self._settings)
-        if result == drivers.MUST_COLLIDE:
-            self._advance_through_space()
-            drivers.conclude(a, self._settings)
-        elif result != drivers.DONE:
+        a, s = self.arrays, self._settings
+        if not self._parts:
+            result = drivers.control_step(a, s)
+            if result == drivers.DONE:
+                return
+        else:
+            result = drivers.prepare(a, s)
+        if result not in (drivers.DONE, drivers.MUST_COLLIDE):
             raise ValueError(
                 f"robot_{result}: the action must be finite, got {a.actions[0, result].tolist()}"
             )
+        self._substep_by_substep(close=result == drivers.MUST_COLLIDE)
+        drivers.transmit(a, s)
+        if s.external_observer:
+            self._parts.observe(a, s)
+        else:
+            drivers.observe_followers(a, s)
+        drivers.look(a, s)
 
-    def _advance_through_space(self) -> None:
-        a, dt_s = self.arrays, self.scenario.physics_period_s
-        for _ in range(self.scenario.substeps):
-            before = a.motions.copy()
-            drivers.actuate(a, False, dt_s)
-            self.plant.collide(before, a.motions, dt_s)
-            drivers.sense(a, dt_s)
+    def _substep_by_substep(self, close: bool) -> None:
+        a, s = self.arrays, self._settings
+        for k in range(s.substeps):
+            self._parts.drive(a)
+            before = a.motions.copy() if close else a.motions
+            drivers.actuate(a, s)
+            if close:
+                self.plant.collide(before, a.motions, s.dt)
+            drivers.sense(a, k, s)
+            self._parts.estimate(a, k)
 
     def state(self) -> np.ndarray:
         """The truth, (robot, :class:`State`), in physical units."""
         return state_rows(self.arrays)
+
+
+def settings(scenario: Scenario) -> drivers.Settings:
+    """The scenario's numbers as the drivers take them."""
+    observer = scenario.observer
+    paper = observer if isinstance(observer, ObserverParameters) else ObserverParameters()
+    kinds = {"ekf": drivers.EKF, "truth": drivers.TRUTH}
+    return drivers.Settings(
+        kinematic=scenario.plant == "kinematic",
+        substeps=scenario.substeps,
+        dt=scenario.physics_period_s,
+        period=scenario.control_period_s,
+        gap=scenario.gap_steps,
+        lookahead=max(scenario.preview_steps, default=0),
+        window=round(TIME_GAP_WINDOW_S / scenario.control_period_s),
+        observer_gain=paper.gain_per_s,
+        smoothing=paper.smoothing_s,
+        lost_beyond=scenario.lost_beyond_mm,
+        estimator=kinds.get(scenario.estimator, drivers.EXTERNAL),
+        external_wheel_loop=isinstance(scenario.wheel_loop, str),
+        external_observer=isinstance(observer, str),
+        cooperative=scenario.cooperative,
+        base=gains_row(tracking_gains(scenario.residual_base)),
+    )
 
 
 def start_poses(scenario: Scenario, first: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -129,12 +173,12 @@ def start_poses(scenario: Scenario, first: Sequence[float] | np.ndarray) -> np.n
     The followers stand ``start_spacing_mm`` apart on the tangent, with the leader's heading.
     """
     x_mm, y_mm, theta = first[0], first[1], first[2]
-    behind = scenario.start_spacing_mm * np.arange(scenario.robots)
+    behind = scenario.start_spacing_mm * np.arange(scenario.robot_count)
     return np.stack(
         [
             x_mm + behind * np.sin(theta),
             y_mm - behind * np.cos(theta),
-            np.full(scenario.robots, theta),
+            np.full(scenario.robot_count, theta),
         ],
         axis=-1,
     )

@@ -1,4 +1,4 @@
-"""What a policy sees: the ``tracking`` observation, entry by entry, and how it is scaled."""
+"""What a policy sees: the observations ``tracking`` and ``sensor``, entry by entry, and their scales."""
 
 from __future__ import annotations
 
@@ -115,3 +115,57 @@ def preview_entries(later: Reference, x: float, y: float, theta: float) -> Previ
     forward, right = body_errors(later.x - x, later.y - y, theta)
     turn = wrap(later.theta - theta)
     return Preview(forward, right, math.sin(turn), math.cos(turn), later.u_1, later.u_2)
+
+
+class SensorTail(NamedTuple):
+    """Entries of the ``sensor`` observation after its samples, in physical units."""
+
+    time: float
+    start_x: float
+    start_y: float
+    start_sin: float
+    start_cos: float
+    message_x: float
+    message_y: float
+    message_sin: float
+    message_cos: float
+    message_u_1: float
+    message_u_2: float
+    is_leader: float
+
+
+SAMPLE_ENTRIES = {
+    "fix_x": Entry("position fix of c, x from the start pose's", "mm", 1000.0),
+    "fix_y": Entry("position fix of c, y from the start pose's", "mm", 1000.0),
+    "step_l": Entry("angle increment of the left wheel", "rad", 0.01),
+    "step_r": Entry("angle increment of the right wheel", "rad", 0.01),
+}
+SENSOR_TAIL_ENTRIES = {
+    "time": Entry(
+        "time since the start; at 0 there is no sample yet, and the samples are 0", "s", 100.0
+    ),
+    "start_x": Entry("start pose of c, x in the world", "mm", 1000.0),
+    "start_y": Entry("start pose of c, y in the world", "mm", 1000.0),
+    "start_sin": Entry("sine of the start heading", "1", 1.0),
+    "start_cos": Entry("cosine of the start heading", "1", 1.0),
+    "message_x": Entry(
+        "x from the own start's: the leader's reference now, or what the predecessor broadcast one "
+        "gap ago (before that, its start pose at rest)",
+        "mm",
+        1000.0,
+    ),
+    "message_y": Entry("y likewise", "mm", 1000.0),
+    "message_sin": Entry("sine of its heading", "1", 1.0),
+    "message_cos": Entry("cosine of its heading", "1", 1.0),
+    "message_u_1": Entry("its speed", "mm/s", 500.0),
+    "message_u_2": Entry("its yaw rate", "rad/s", 2.0),
+    "is_leader": Entry("1 for the leader (robot_0)", "1", 1.0),
+}
+
+
+def sensor_entries(substeps: int) -> dict[str, Entry]:
+    """All entries of ``sensor`` by name, in order; the samples' names carry their number, oldest first."""
+    samples = {
+        f"{name}_{k}": entry for k in range(substeps) for name, entry in SAMPLE_ENTRIES.items()
+    }
+    return samples | SENSOR_TAIL_ENTRIES

@@ -13,6 +13,8 @@ from pydantic import Field, FiniteFloat, ValidationError, field_validator, model
 from tlf_env.numerics.errors import one_line
 from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.observer import ObserverParameters
+from tlf_env.onboard.parts import PART_PATTERN
+from tlf_env.onboard.tracking import tracking_gains
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive, RobotParameters
 from tlf_env.task.disturbance import Disturbance, constant_effects
@@ -26,6 +28,7 @@ DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
 
 EndReason = Literal["lost", "touched"]
+PartPath = Annotated[str, Field(pattern=PART_PATTERN)]
 
 
 def presets_folder() -> Path:
@@ -78,7 +81,10 @@ class Scenario(Frozen):
 
     name: str = "custom"
     trajectory: Trajectory
-    robots: Annotated[int, Field(ge=1, le=MAX_ROBOTS)] = 3
+    robots: (
+        Annotated[int, Field(ge=1, le=MAX_ROBOTS)]
+        | Annotated[tuple[RobotParameters, ...], Field(min_length=1, max_length=MAX_ROBOTS)]
+    ) = 3  # how many, or each one's parameters where they differ from `robot`
     robot: RobotParameters = RobotParameters()
     time_gap_s: Positive = 5.0
     start_spacing_mm: Positive = 300.0
@@ -88,19 +94,35 @@ class Scenario(Frozen):
     horizon_s: Positive = 100.0
     plant: Literal["pymunk", "kinematic"] = "pymunk"
 
-    wheel_loop: WheelLoopParameters = WheelLoopParameters()
-    estimator: Literal["ekf"] = "ekf"
+    wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
+    estimator: Literal["ekf", "truth"] | PartPath = "ekf"
     ekf: EkfParameters = EkfParameters()
-    observer: ObserverParameters = ObserverParameters()
+    observer: ObserverParameters | PartPath = ObserverParameters()
 
     disturbance: Disturbance = Disturbance()
 
-    action: Literal["twist", "wheel_speed"] = "twist"
-    observation: Literal["tracking"] = "tracking"
+    action: Literal["twist", "wheel_speed", "torque", "residual"] = "twist"
+    residual_base: str = "consistent"  # gains of the tracking law that a residual is added to
+    observation: Literal["tracking", "sensor"] = "tracking"
+    dtype: Literal["float32", "float64"] = "float32"  # of observations and actions
     preview_s: tuple[NonNegative, ...] = (0.5, 1.0)
     reward: dict[str, FiniteFloat] = Field(default_factory=DEFAULT_WEIGHTS._asdict)
+    cooperative: bool = False  # every robot gets the formation's mean reward
     end_on: tuple[EndReason, ...] = ("lost", "touched")
     lost_beyond_mm: Positive = 1200.0
+
+    @model_validator(mode="before")
+    @classmethod
+    def _different_robots(cls, data: Any) -> Any:
+        if isinstance(data, Mapping) and isinstance(data.get("robots"), list | tuple):
+            base = data.get("robot", {})
+            if isinstance(base, RobotParameters):
+                base = base.model_dump()
+            robots = [
+                _merged(base, one) if isinstance(one, Mapping) else one for one in data["robots"]
+            ]
+            return {**data, "robots": robots}
+        return data
 
     @field_validator("disturbance", mode="before")
     @classmethod
@@ -148,14 +170,38 @@ class Scenario(Frozen):
             raise ValueError(
                 f"horizon_s {self.horizon_s} is more than {MAX_STEPS} steps of physics_period_s"
             )
-        room_mm = 2 * self.robot.outline_radius_mm
-        if self.robots > 1 and self.start_spacing_mm <= room_mm:
+        room_mm = 2 * max(robot.outline_radius_mm for robot in self.robot_models)
+        if self.robot_count > 1 and self.start_spacing_mm <= room_mm:
             raise ValueError(
                 f"start_spacing_mm {self.start_spacing_mm} must be above {room_mm:g}, or the "
                 "robots touch at the start"
             )
         constant_effects(self.disturbance)
+        tracking_gains(self.residual_base)
+        if self.plant == "kinematic" and (
+            self.action == "torque" or isinstance(self.wheel_loop, str)
+        ):
+            raise ValueError(
+                "plant 'kinematic' has no torques: no action 'torque', no wheel_loop part"
+            )
         return self
+
+    @property
+    def robot_count(self) -> int:
+        """How many robots."""
+        return self.robots if isinstance(self.robots, int) else len(self.robots)
+
+    @property
+    def robot_models(self) -> tuple[RobotParameters, ...]:
+        """Parameters of every robot."""
+        if isinstance(self.robots, int):
+            return (self.robot,) * self.robots
+        return self.robots
+
+    @property
+    def privileged(self) -> bool:
+        """Whether what a policy sees comes from the truth."""
+        return self.estimator == "truth"
 
     @property
     def substeps(self) -> int:

@@ -1,0 +1,159 @@
+"""The Gymnasium environment: one robot learns, the others are driven."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+import gymnasium
+import numpy as np
+
+from tlf_env.envs.parallel import RENDER_MODES, FormationParallelEnv
+from tlf_env.onboard.parts import load_part
+from tlf_env.task.actions import ACTION_SIZE, RESIDUAL, TWIST
+from tlf_env.task.scenario import Scenario
+
+REFERENCE = "reference"
+
+
+class Predicts(Protocol):
+    """Whatever drives: the signature of SB3's ``predict``."""
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """Actions for a batch of observations, and the next state."""
+
+
+class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """One learner in a formation whose other robots are driven by a policy.
+
+    Action, observation, reward and info are those of the learner in
+    :class:`tlf_env.envs.parallel.FormationParallelEnv`. The episode is terminated if the learner is
+    lost or touches another robot, and truncated at the horizon or if another robot ends it.
+
+    Parameters
+    ----------
+    scenario
+        A preset's name, a YAML file, a mapping or a :class:`~tlf_env.task.scenario.Scenario`.
+    learner
+        The agent that acts, ``"robot_0"`` to ``"robot_{n-1}"``; ``robot_1`` if None, in a formation
+        of one robot ``robot_0``.
+    others
+        Who drives the rest: ``"reference"`` (the tracking law with the gains of ``residual_base``),
+        an object with SB3's ``predict`` that takes ``tracking`` observations and gives ``twist``
+        actions, or ``"module:factory"`` that makes one.
+    render_mode
+        None, ``"rgb_array"`` or ``"human"``.
+    **overrides
+        Fields of the scenario; ``disturbance_level`` too.
+
+    Raises
+    ------
+    ValueError
+        for an unknown learner, key or value, in one line.
+    """
+
+    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": 50}
+
+    def __init__(
+        self,
+        scenario: str | Path | Mapping[str, Any] | Scenario = "infinity",
+        *,
+        learner: str | None = None,
+        others: str | Predicts = REFERENCE,
+        render_mode: str | None = None,
+        **overrides: Any,
+    ) -> None:
+        self.formation_env = FormationParallelEnv(scenario, render_mode=render_mode, **overrides)
+        agents = self.formation_env.possible_agents
+        learner = learner or agents[min(1, len(agents) - 1)]
+        if learner not in agents:
+            raise ValueError(f"learner {learner!r} is not one of {', '.join(agents)}")
+        self.learner = learner
+        self.render_mode = render_mode
+        self.metadata = dict(self.formation_env.metadata)
+        self.observation_space = self.formation_env.observation_space(learner)
+        self.action_space = self.formation_env.action_space(learner)
+        self._rest = [i for i, agent in enumerate(agents) if agent != learner]
+        self._driver = self._make_driver(others)
+        self._driver_state: Any = None
+        kinds = self.formation_env.formation.arrays.kinds
+        kinds[self._rest] = RESIDUAL if self._driver is None else TWIST
+        self._driver_start = np.ones(len(self._rest), dtype=np.bool_)
+        self._still = {
+            agents[i]: np.zeros(ACTION_SIZE, self.action_space.dtype) for i in self._rest
+        }
+
+    @staticmethod
+    def _make_driver(others: str | Predicts) -> Predicts | None:
+        if isinstance(others, str):
+            if others == REFERENCE:
+                return None
+            if ":" not in others:
+                raise ValueError(
+                    f"others {others!r} is neither {REFERENCE!r} nor 'module:factory' nor an object"
+                )
+            others = load_part(others)()
+        if not hasattr(others, "predict"):
+            raise ValueError(f"others {others!r} has no predict()")
+        return others
+
+    @property
+    def scenario(self) -> Scenario:
+        """All that an episode depends on but its seed."""
+        return self.formation_env.scenario
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode; as :meth:`FormationParallelEnv.reset`, for the learner."""
+        super().reset(seed=seed)
+        observations, infos = self.formation_env.reset(seed=seed, options=options)
+        self._driver_state = None
+        self._driver_start[:] = True
+        return observations[self.learner], infos[self.learner]
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Advance all robots by one control period.
+
+        Raises
+        ------
+        ValueError
+            for a wrongly shaped or non-finite action; the episode stands as it was.
+        RuntimeError
+            before the first reset, or after the end of the episode.
+        """
+        if not self.formation_env.agents:
+            raise RuntimeError("call reset() before step()")
+        actions = self._drive() | {self.learner: action}
+        observations, rewards, terminated, truncated, infos = self.formation_env.step(actions)
+        me = self.learner
+        return observations[me], rewards[me], terminated[me], truncated[me], infos[me]
+
+    def _drive(self) -> dict[str, np.ndarray]:
+        if self._driver is None or not self._rest:
+            return dict(self._still)  # a residual of zero is the reference itself
+        seen = self.formation_env.formation.arrays.observations[0, self._rest]
+        actions, self._driver_state = self._driver.predict(
+            seen, self._driver_state, self._driver_start.copy(), True
+        )
+        self._driver_start[:] = False
+        return dict(zip(self._still, actions, strict=True))
+
+    def state(self) -> np.ndarray:
+        """The truth for critics; see :meth:`FormationParallelEnv.state`."""
+        return self.formation_env.state()
+
+    def render(self) -> np.ndarray | None:  # type: ignore[override]
+        """A frame in mode ``rgb_array``, None in mode ``human``."""
+        return self.formation_env.render()
+
+    def close(self) -> None:
+        """Close the window, if there is one."""
+        self.formation_env.close()

@@ -1,0 +1,80 @@
+"""What an action means: four kinds, all in [−1, 1]², turned into wheel speeds or torques."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tlf_env.numerics.compiled import law
+from tlf_env.onboard.tracking import Gains, tracking_twist
+from tlf_env.physics.parameters import Body
+from tlf_env.task.observation import Entry, Tracking
+
+ACTION_SIZE = 2
+TWIST, WHEEL_SPEED, TORQUE, RESIDUAL = range(4)
+ACTION_KINDS = {
+    "twist": TWIST,
+    "wheel_speed": WHEEL_SPEED,
+    "torque": TORQUE,
+    "residual": RESIDUAL,
+}
+
+FULL_SPEED_MM_S = 1000.0
+FULL_YAW_RATE_RAD_S = 8.0
+FULL_WHEEL_SPEED_RAD_S = 25.0
+FULL_TORQUE_NMM = 15.0
+FULL_RESIDUAL_MM_S = 150.0
+FULL_RESIDUAL_RAD_S = 1.0
+
+ACTION_ENTRIES = {
+    "twist": (
+        Entry("forward speed u₁ asked of the wheel loops", "mm/s", FULL_SPEED_MM_S),
+        Entry("yaw rate u₂, counter-clockwise", "rad/s", FULL_YAW_RATE_RAD_S),
+    ),
+    "wheel_speed": (
+        Entry("speed of the left wheel asked of its loop", "rad/s", FULL_WHEEL_SPEED_RAD_S),
+        Entry("speed of the right wheel", "rad/s", FULL_WHEEL_SPEED_RAD_S),
+    ),
+    "torque": (
+        Entry("torque on the left wheel, past the wheel loop", "N·mm", FULL_TORQUE_NMM),
+        Entry("torque on the right wheel", "N·mm", FULL_TORQUE_NMM),
+    ),
+    "residual": (
+        Entry("forward speed added to the twist of residual_base", "mm/s", FULL_RESIDUAL_MM_S),
+        Entry("yaw rate added to it", "rad/s", FULL_RESIDUAL_RAD_S),
+    ),
+}
+
+E_1 = Tracking._fields.index("e_1")
+E_2 = Tracking._fields.index("e_2")
+SIN_E_3 = Tracking._fields.index("sin_e_3")
+COS_E_3 = Tracking._fields.index("cos_e_3")
+U_1 = Tracking._fields.index("reference_u_1")
+U_2 = Tracking._fields.index("reference_u_2")
+
+
+@law
+def reference_action(
+    observation: np.ndarray, scales: np.ndarray, gains: Gains
+) -> tuple[float, float]:
+    """The tracking law, eqs (16)–(21), as a ``twist`` action, from one ``tracking`` observation.
+
+    Within [−1, 1].
+    """
+    u_1, u_2 = tracking_twist(
+        observation[E_1] * scales[E_1],
+        observation[E_2] * scales[E_2],
+        observation[SIN_E_3] * scales[SIN_E_3],
+        observation[COS_E_3] * scales[COS_E_3],
+        observation[U_1] * scales[U_1],
+        observation[U_2] * scales[U_2],
+        gains,
+    )
+    a_0 = min(max(u_1 / FULL_SPEED_MM_S, -1.0), 1.0)
+    a_1 = min(max(u_2 / FULL_YAW_RATE_RAD_S, -1.0), 1.0)
+    return a_0, a_1
+
+
+@law
+def wheel_speeds(forward: float, turn: float, body: Body) -> tuple[float, float]:
+    """Wheel speeds (left, right; rad/s) of a twist (mm/s, rad/s): the inverse of eq. (1)."""
+    return (forward - turn * body.h) / body.R, (forward + turn * body.h) / body.R
