@@ -5,8 +5,9 @@ Everything is drawn twice as large as it is shown and scaled down: that smooths 
 
 from __future__ import annotations
 
+import math
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -60,20 +61,29 @@ VIRIDIS = np.array(
 )
 LIGHTEST = 0.92  # of the map; its end is lost on white
 
-DRIVE_WHEEL_WIDTH_MM, CASTOR_WIDTH_MM = 22.0, 14.0  # for the picture only
+DRIVE_WHEEL_WIDTH_MM, CASTOR_WIDTH_MM, AXLE_MM = 22.0, 14.0, 8.0  # for the picture only
 TREADS = 4  # few: more would seem to turn backwards at top speed and 20 frames/s
-SLIP_SHOWN_MM_S, SLIP_FULL_MM_S = 2.0, 60.0  # where a wheel's mark begins, and where it is strongest
+SLIP_SHOWN_MM_S, SLIP_FULL_MM_S = (
+    2.0,
+    60.0,
+)  # where a wheel's mark begins, and where it is strongest
 
+ARM_RADII = 0.35  # arms of the reference's cross
 MARGIN_RADII = 3.0  # room around the path, in outline radii
 MOST_START_MM = 1500.0  # how far the view grows towards robots that start off the path
+STILL_MM = 1e-3  # who went less has no direction
 TRAIL_POINTS = 120
 PATH_POINTS = 1500
 TRAIL_PX, PATH_PX = 5.0, 2.0
 CLOSE_UP_PX, CLOSE_UP_RADII = 208, 4.0  # side of the close-up; how much floor, in outline radii
-EDGE_PX = 14
+CLOSE_UP_PEN = 1.3  # its lines against the others
+EDGE_PX, LINE_PX = 14, 18
+TEXT_PX, TIME_PX = 19, 27  # of pygame's own font, whose letters are two thirds of that
 GRID_PX = 90  # least side of a grid square
-TEXT_PX, TIME_PX = 15, 22
-LINE_PX = 19
+COLUMNS_PX = (18, 140, 208, 218)  # name, error, time gap, flags
+
+CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 49)) for f in (np.cos, np.sin)], axis=-1)
+NOSE = np.array([[-0.26, 0.44], [0.26, 0.44], [0.0, 0.92]])  # of what the outline is ahead of c
 
 
 class Scene(NamedTuple):
@@ -148,7 +158,7 @@ def _ghosts(formation: Formation, theta: np.ndarray) -> np.ndarray:
     slots = paths.shape[1]
     went_x, went_y = paths[:, (step + 1) % slots] - paths[:, max(step - 1, 0) % slots]
     ghosts[:2, 1:] = paths[:, step % slots]
-    moved = np.hypot(went_x, went_y) > 1e-3
+    moved = np.hypot(went_x, went_y) > STILL_MM
     ghosts[2, 1:] = np.where(moved, np.arctan2(-went_x, went_y), theta[:-1])
     return ghosts
 
@@ -163,7 +173,7 @@ def robot_colours(robots: int) -> list[Colour]:
 
 
 class View(NamedTuple):
-    """Where the floor lies on the canvas: a window of it, all lengths in canvas px unless said."""
+    """A window of the canvas and the floor in it; lengths in canvas px unless said."""
 
     left: int
     top: int
@@ -171,19 +181,19 @@ class View(NamedTuple):
     height: int
     corner_mm: tuple[float, float]  # x of the left edge, y of the top edge
     scale: float  # px per mm
-    pen: float  # px per px of the finished picture
+    pen: float  # px per px of the design
 
     def px(self, points_mm: np.ndarray) -> np.ndarray:
         """Canvas coordinates of points ``(..., 2)``; half a px on, since pygame cuts fractions off."""
-        offset = np.array([self.left, self.top]) + 0.5
-        return (points_mm - self.corner_mm) * [self.scale, -self.scale] + offset
+        offset = (self.left + 0.5, self.top + 0.5)
+        return (points_mm - self.corner_mm) * (self.scale, -self.scale) + offset
 
-    def mm(self, length_px: float) -> float:
-        """Length on the floor of a length in the finished picture."""
-        return length_px * self.pen / self.scale
+    def mm(self, design_px: float) -> float:
+        """Length on the floor of a length in the design."""
+        return design_px * self.pen / self.scale
 
-    def shows(self, px: np.ndarray, room: float) -> np.ndarray:
-        """Which canvas points lie in the window or at most ``room`` px beside it; NaN never does."""
+    def shows(self, px: np.ndarray, room: float = 0.0) -> np.ndarray:
+        """Which canvas points lie in the window or less than ``room`` beside it; NaN never does."""
         x, y = px[..., 0] - self.left, px[..., 1] - self.top
         return (x > -room) & (x < self.width + room) & (y > -room) & (y < self.height + room)
 
@@ -191,6 +201,24 @@ class View(NamedTuple):
     def rect(self) -> tuple[int, int, int, int]:
         """The window, as pygame takes rectangles."""
         return self.left, self.top, self.width, self.height
+
+
+class Frame(NamedTuple):
+    """A pose as a map: from its own axes (e right, f forward) to the floor, mm."""
+
+    x: float
+    y: float
+    theta: float
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        """Points ``(k, 2)`` on the floor."""
+        sin, cos = math.sin(self.theta), math.cos(self.theta)
+        return points @ np.array([[cos, sin], [-sin, cos]]) + (self.x, self.y)
+
+    def at(self, e: float, f: float, turn: float = 0.0) -> Frame:
+        """A frame that lies in this one."""
+        x, y = self(np.array([e, f]))
+        return Frame(x, y, self.theta + turn)
 
 
 class Renderer:
@@ -201,28 +229,28 @@ class Renderer:
     robots
         Each robot's measures.
     path_mm
-        The leader's whole reference, ``(k, 2)``. The view is fixed to it and to the robots' start;
-        a robot that leaves the view shows as an arrow at its edge.
+        The leader's whole reference, ``(k, 2)``. The view holds it and the robots' start, and stays;
+        a robot that leaves it shows as an arrow at the edge.
     mode
-        ``"rgb_array"`` returns frames and needs no display; ``"human"`` shows them in a window, at
-        ``fps`` frames per second at most.
+        ``"rgb_array"``: frames as arrays, without any display. ``"human"``: a window, which waits so
+        that there are at most ``fps`` frames a second.
     fps
         Frames per second.
     size_px
         Width and height of the picture.
     trail_s
-        How long the robots' trails are.
+        How far back the robots' trails go.
     patches
         Round patches of other friction: mappings of ``x_mm``, ``y_mm``, ``radius_mm`` and ``scale``.
     close_up
-        The robot to draw large in a corner, or None. Where there is no such robot, the last.
+        The robot to draw large in a corner, or None. The last, if there are not so many.
 
     Raises
     ------
     ImportError
         without pygame, saying how to install it.
     ValueError
-        for an unknown mode or a size too small to draw on.
+        for an unknown mode or a picture too small to draw on.
     """
 
     def __init__(
@@ -243,311 +271,412 @@ class Renderer:
             raise ValueError(f"size_px {size_px} must be at least {SMALLEST_PX} each way")
         self._pg = _pygame()
         self._robots = list(robots)
-        self._shapes = [_shapes(robot) for robot in robots]
         self._colours = robot_colours(len(robots))
         stride = max(1, len(path_mm) // PATH_POINTS)
-        self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])[:, None]
+        self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
         self._patches = list(patches)
-        self._mode, self._fps, self._trail_s = mode, fps, trail_s
+        self._fps, self._trail_s = fps, trail_s
         self._focus = None if close_up is None else min(close_up, len(robots) - 1)
         self._trail: list[tuple[float, np.ndarray]] = []  # time, (robot, 2)
-        self._start_mm = np.empty((0, 2))
-        self._open = True
-        self._window: Any = None
-        if mode == "human":
+        self._open, self._window = True, mode == "human"
+        if self._window:
             self._open_window(size_px)
         self._resize(size_px)
 
     def draw(self, scene: Scene) -> np.ndarray | None:
-        """Draw a scene.
+        """Draw a scene; one whose time goes back begins a new episode.
 
-        A scene whose time goes back begins a new episode. Returns a fresh uint8 ``(H, W, 3)`` in the
-        mode ``"rgb_array"``, else None; also None, and nothing happens, once closed.
+        Returns a fresh uint8 array ``(H, W, 3)`` in the mode ``"rgb_array"``, else None. Once closed,
+        nothing happens.
         """
-        if self._window is not None:
+        if self._window:
             self._handle_events()
         if not self._open:
             return None
         self._remember(scene)
-        if self._background is None:
-            self._background = self._draw_background()
+        self._background = self._background or self._draw_background()
         self._canvas.blit(self._background, (0, 0))
         self._draw_robots(self._view, scene)
+        self._draw_arrows(scene)
         if self._focus is not None:
             self._draw_close_up(self._focus, scene)
-        self._pg.transform.smoothscale(self._canvas, self._size_px, self._frame)
+        self._pg.transform.smoothscale(self._canvas, self._size_px, self._picture)
         self._write(scene)
-        if self._window is None:
-            return self._pixels()
-        self._window.blit(self._frame, (0, 0))
-        self._pg.display.flip()
-        self._clock.tick(self._fps)
-        return None
+        if self._window:
+            self._show()
+            return None
+        return self._pixels()
 
     def close(self) -> None:
         """Close the window. Drawing does nothing from now on."""
-        self._open = False
-        if self._window is not None:
-            self._window = None
+        if self._open and self._window:
             self._pg.display.quit()
+        self._open = False
 
-    # The window
-
-    def _open_window(self, size_px: tuple[int, int]) -> None:
-        self._pg.display.init()
-        self._window = self._pg.display.set_mode(size_px, self._pg.RESIZABLE)
-        self._pg.display.set_caption("tlf_env")
-        self._clock = self._pg.time.Clock()
-
-    def _handle_events(self) -> None:
-        for event in self._pg.event.get():
-            if event.type == self._pg.QUIT:
-                self.close()
-                return
-            if event.type == self._pg.VIDEORESIZE:
-                self._window = self._pg.display.get_surface()
-                self._resize(self._window.get_size())
+    # Picture and window
 
     def _resize(self, size_px: tuple[int, int]) -> None:
         pg = self._pg
         self._size_px = (max(size_px[0], SMALLEST_PX), max(size_px[1], SMALLEST_PX))
-        width, height = (OVERSAMPLING * side for side in self._size_px)
-        self._canvas = pg.Surface((width, height), 0, 32)
-        self._frame = pg.Surface(self._size_px, 0, 32)
-        size = np.array(self._size_px) / DESIGN_SIZE_PX
-        self._unit = float(size.min())  # px per px of the design
-        self._font = pg.font.Font(None, max(9, round(TEXT_PX * 1.25 * self._unit)))
-        self._time_font = pg.font.Font(None, max(11, round(TIME_PX * 1.25 * self._unit)))
-        self._large_font = pg.font.Font(
-            None, OVERSAMPLING * max(9, round(TEXT_PX * 1.15 * self._unit))
+        self._canvas = pg.Surface([OVERSAMPLING * side for side in self._size_px], 0, 32)
+        self._picture = pg.Surface(self._size_px, 0, 32)
+        width, height = self._size_px
+        self._unit = min(width / DESIGN_SIZE_PX[0], height / DESIGN_SIZE_PX[1])
+        self._font, self._time_font, self._canvas_font = (
+            pg.font.Font(None, max(10, round(size * self._unit)))
+            for size in (TEXT_PX, TIME_PX, TEXT_PX * OVERSAMPLING)
         )
         self._background: Any = None
 
     def _pixels(self) -> np.ndarray:
         width, height = self._size_px
-        flat = np.frombuffer(bytearray(self._pg.image.tobytes(self._frame, "RGB")), np.uint8)
-        return flat.reshape(height, width, 3)
+        data = bytearray(self._pg.image.tobytes(self._picture, "RGB"))
+        return np.frombuffer(data, np.uint8).reshape(height, width, 3)
+
+    def _open_window(self, size_px: tuple[int, int]) -> None:
+        self._pg.display.init()
+        self._pg.display.set_mode(size_px, self._pg.RESIZABLE)
+        self._pg.display.set_caption("tlf_env")
+        self._clock = self._pg.time.Clock()
+
+    def _handle_events(self) -> None:
+        if not self._open:
+            return
+        if not self._pg.display.get_init() or self._pg.event.get(self._pg.QUIT):
+            self.close()
+            return
+        self._pg.event.get()
+        size_px = self._pg.display.get_window_size()
+        if size_px != self._size_px and min(size_px) >= SMALLEST_PX:
+            self._resize(size_px)
+
+    def _show(self) -> None:
+        self._pg.display.get_surface().blit(self._picture, (0, 0))
+        self._pg.display.flip()
+        self._clock.tick(self._fps)
 
     # Memory
 
     def _remember(self, scene: Scene) -> None:
-        """Add to the trails; one point in each of ``TRAIL_POINTS`` parts of a trail's time stays."""
+        """Lengthen the trails: about ``TRAIL_POINTS`` points evenly in time, and the robots' place now."""
         places = np.stack([scene.x_mm, scene.y_mm], axis=-1)
         if not self._trail or scene.t_s < self._trail[-1][0]:
             self._trail.clear()
-            self._start_mm = places
-            self._background = None
-        every_s = self._trail_s / TRAIL_POINTS
-        if len(self._trail) > 1 and self._trail[-1][0] - self._trail[-2][0] < every_s:
+            self._start_mm, self._background = places, None
+        spacing_s = self._trail_s / TRAIL_POINTS
+        if len(self._trail) > 1 and self._trail[-1][0] - self._trail[-2][0] < spacing_s:
             self._trail.pop()
         self._trail.append((scene.t_s, places))
         while self._trail[0][0] < scene.t_s - self._trail_s:
             self._trail.pop(0)
 
-    # The floor
+    # Floor
 
     def _fit(self) -> View:
-        """The view of the path and of the start; spare width is left of it, where the text is."""
+        """The view of path and start. Spare width is left of them, where the text is."""
         room = MARGIN_RADII * max(robot.outline_radius_mm for robot in self._robots)
-        path = self._path_mm[:, 0]
-        low, high = path.min(axis=0), path.max(axis=0)
+        low, high = self._path_mm.min(axis=0), self._path_mm.max(axis=0)
         start = np.clip(self._start_mm, low - MOST_START_MM, high + MOST_START_MM)
         low = np.minimum(low, start.min(axis=0)) - room
         high = np.maximum(high, start.max(axis=0)) + room
-        size = OVERSAMPLING * np.array(self._size_px)
-        scale = float((size / (high - low)).min())
-        spare_mm = size / scale - (high - low)
-        corner = (float(low[0] - spare_mm[0]), float(high[1] + spare_mm[1] / 2))
-        return View(0, 0, int(size[0]), int(size[1]), corner, scale, OVERSAMPLING * self._unit)
+        width, height = self._canvas.get_size()
+        scale = min(width / (high[0] - low[0]), height / (high[1] - low[1]))
+        left = high[0] - width / scale
+        top = (low[1] + high[1] + height / scale) / 2
+        return View(0, 0, width, height, (left, top), scale, OVERSAMPLING * self._unit)
 
     def _draw_background(self) -> Any:
-        self._view = view = self._fit()
-        step_m = _round_length_m(view.mm(GRID_PX))
-        self._draw_floor(view, step_m)
-        self._draw_scale_bar(view, step_m)
+        self._view = self._fit()
+        step_mm = round_length(self._view.mm(GRID_PX))
+        self._draw_floor(self._view, step_mm)
+        self._draw_scale_bar(self._view, step_mm)
         if self._focus is not None:
             self._draw_legend()
         return self._canvas.copy()
 
-    def _draw_floor(self, view: View, step_m: float) -> None:
-        canvas = self._canvas
-        canvas.fill(FLOOR, view.rect)
+    def _draw_floor(self, view: View, step_mm: float) -> None:
+        self._canvas.fill(FLOOR, view.rect)
         for patch in self._patches:
             self._draw_patch(view, patch)
-        step_mm = 1000 * step_m
         for colour, phase in ((HALF_GRID, 0.5), (GRID, 0.0)):
-            for x in view.px(_grid(view, step_mm, phase)[0])[:, 0].astype(int).tolist():
-                canvas.fill(colour, (x, view.top, OVERSAMPLING, view.height))
-            for y in view.px(_grid(view, step_mm, phase)[1])[:, 1].astype(int).tolist():
-                canvas.fill(colour, (view.left, y, view.width, OVERSAMPLING))
+            columns, rows = _grid_lines(view, step_mm, phase)
+            for x in columns:
+                self._canvas.fill(colour, (x, view.top, OVERSAMPLING, view.height))
+            for y in rows:
+                self._canvas.fill(colour, (view.left, y, view.width, OVERSAMPLING))
         width_mm = np.full(len(self._path_mm), view.mm(PATH_PX))
-        self._ribbons(view, self._path_mm, width_mm, lambda j, i: PATH)
+        self._draw_lines(view, self._path_mm[:, None], width_mm, lambda j, i: PATH)
 
     def _draw_patch(self, view: View, patch: Mapping[str, float]) -> None:
         centre = np.array([patch["x_mm"], patch["y_mm"]])
         colour = SLIPPERY if patch["scale"] < 1 else GRIPPY
         self._fill(view, centre + patch["radius_mm"] * CIRCLE, colour)
-        if view.shows(view.px(centre), 0):
-            label = self._large_font.render(f"µ × {patch['scale']:g}", True, INK)
-            self._canvas.blit(label, label.get_rect(center=view.px(centre).tolist()))
+        if view is self._view:
+            self._label(f"µ × {patch['scale']:g}", center=view.px(centre).tolist())
 
-    def _draw_scale_bar(self, view: View, length_m: float) -> None:
-        pen, length = view.pen, 1000 * length_m * view.scale
-        x, y = view.width - EDGE_PX * pen - length, view.height - EDGE_PX * pen
+    def _draw_scale_bar(self, view: View, length_mm: float) -> None:
+        pen, length = self._view.pen, length_mm * view.scale
+        right, bottom = view.left + view.width, view.top + view.height
+        x, y = right - EDGE_PX * pen - length, bottom - EDGE_PX * pen
         self._canvas.fill(INK, (x, y - pen, length, 2 * pen))
         for end in (x, x + length - 2 * pen):
             self._canvas.fill(INK, (end, y - 4 * pen, 2 * pen, 8 * pen))
-        label = self._large_font.render(f"{length_m:g} m", True, INK)
-        self._canvas.blit(label, label.get_rect(midbottom=(x + length / 2, y - 4 * pen)))
+        text = f"{length_mm:g} mm" if length_mm < 1000 else f"{length_mm / 1000:g} m"
+        self._label(text, midbottom=(x + length / 2, y - 4 * pen))
+
+    def _label(self, text: str, **anchor: Any) -> None:
+        """Text on the canvas; ``anchor`` as pygame names a rectangle's points."""
+        image = self._canvas_font.render(text, True, INK)
+        self._canvas.blit(image, image.get_rect(**anchor))
 
     # Robots
 
     def _draw_robots(self, view: View, scene: Scene) -> None:
-        """Trails first, then the robots, then what they should cover."""
         self._draw_trails(view)
-        places = np.stack([scene.x_mm, scene.y_mm], axis=-1)
         room = 2 * view.scale * max(robot.outline_radius_mm for robot in self._robots)
-        shown = view.shows(view.px(places), room)
-        for i in np.flatnonzero(shown)[::-1].tolist():
-            self._draw_robot(view, scene, i)
-        for i in range(len(self._robots)):
-            self._draw_ghost(view, scene, i)
-            self._draw_reference(view, scene, i)
+        places = np.stack([scene.x_mm, scene.y_mm], axis=-1)
+        ghosts = np.stack([scene.ghost_x_mm, scene.ghost_y_mm], axis=-1)
+        references = np.stack([scene.reference_x_mm, scene.reference_y_mm], axis=-1)
+        for draw, points in (
+            (self._draw_robot, places),
+            (self._draw_ghost, ghosts),
+            (self._draw_reference, references),
+        ):
+            for i in np.flatnonzero(view.shows(view.px(points), room)).tolist():
+                draw(view, scene, i)
 
     def _draw_trails(self, view: View) -> None:
-        """Coloured at the robot, thinner and paler the older; the youngest on top."""
-        points = np.stack([places for _, places in self._trail])
-        if len(points) < 2:
+        """Thinner and paler the older; the youngest of all robots on top."""
+        if len(self._trail) < 2:
             return
-        times = np.array([t_s for t_s, _ in self._trail])
-        youth = 1 - (times[-1] - times) / self._trail_s
+        points = np.stack([places for _, places in self._trail])
+        age_s = self._trail[-1][0] - np.array([t_s for t_s, _ in self._trail])
+        youth = 1 - age_s / self._trail_s
         colours = [
-            [_mixed(FLOOR, colour, 0.15 + 0.7 * y) for colour in self._colours]
-            for y in youth[1:].tolist()
+            [mixed(FLOOR, colour, 0.15 + 0.7 * part) for colour in self._colours]
+            for part in youth[1:].tolist()
         ]
-        self._ribbons(view, points, view.mm(TRAIL_PX) * youth, lambda j, i: colours[j][i])
+        self._draw_lines(view, points, view.mm(TRAIL_PX) * youth, lambda j, i: colours[j][i])
 
     def _draw_robot(self, view: View, scene: Scene, i: int) -> None:
-        robot, shapes, colour = self._robots[i], self._shapes[i], self._colours[i]
-        at = _placement(scene.x_mm[i], scene.y_mm[i], scene.theta_rad[i])
-        line = view.mm(1.4)
-        self._fill(view, at(shapes.outline(line / 2)), _mixed(FLOOR, colour, 0.85))
-        self._fill(view, at(shapes.outline(-line / 2)), _mixed(FLOOR, colour, 0.25))
-        self._fill(view, at(shapes.axle), _mixed(FLOOR, colour, 0.6))
-        self._fill(view, at(shapes.nose), colour)
-        fork = at(shapes.pivot).reshape(2)
-        castor = _placement(fork[0], fork[1], scene.theta_rad[i] + scene.castor_rad[i])
-        self._draw_wheel(view, castor(shapes.castor), scene.slip_c_mm_s[i])
-        half = robot.axle_width_mm / 2
-        wheels = (
+        robot, colour = self._robots[i], self._colours[i]
+        body = Frame(scene.x_mm[i], scene.y_mm[i], scene.theta_rad[i])
+        centre, line = body.at(0, -robot.outline_offset_mm), view.mm(1.4)
+        radius, half = robot.outline_radius_mm, robot.axle_width_mm / 2
+        self._fill(view, centre((radius + line / 2) * CIRCLE), mixed(FLOOR, colour, 0.85))
+        self._fill(view, centre((radius - line / 2) * CIRCLE), mixed(FLOOR, colour, 0.25))
+        self._fill(view, body(_rectangle(2 * half, AXLE_MM)), mixed(FLOOR, colour, 0.6))
+        self._fill(view, body((radius - robot.outline_offset_mm) * NOSE), colour)
+        fork = body.at(0, -robot.castor_pivot_mm, scene.castor_rad[i])
+        castor = fork.at(0, -robot.castor_trail_mm)
+        castor_mm = CASTOR_WIDTH_MM, 2 * robot.castor_radius_mm
+        self._draw_tyre(view, castor, castor_mm, scene.slip_c_mm_s[i])
+        wheel_mm = DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm
+        for e, angle, slip in (
             (-half, scene.wheel_angle_l_rad[i], scene.slip_l_mm_s[i]),
             (half, scene.wheel_angle_r_rad[i], scene.slip_r_mm_s[i]),
-        )
-        for across, angle, slip in wheels:
-            tyre = _rectangle(DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm) + [across, 0]
-            self._draw_wheel(view, at(tyre), slip)
+        ):
+            self._draw_tyre(view, body.at(e, 0), wheel_mm, slip)
             for tread in _treads(robot.wheel_radius_mm, angle):
-                self._fill(view, at(tread + [across, 0]), TREAD)
+                self._fill(view, body.at(e, 0)(tread), TREAD)
         if scene.touched[i]:
-            self._fill(view, at(shapes.ring(view.mm(3.0))), ALARM)
+            self._fill(view, centre(_ring(radius, view.mm(3.5))), ALARM)
         if scene.lost[i]:
-            for bar in _cross(1.1 * robot.outline_radius_mm, view.mm(3.0), turn=np.pi / 4):
-                self._fill(view, at(bar + shapes.centre), ALARM)
+            for bar in _cross(0.9 * radius, view.mm(3.5)):
+                self._fill(view, centre.at(0, 0, math.pi / 4)(bar), ALARM)
 
-    def _draw_wheel(self, view: View, tyre: np.ndarray, slip_mm_s: float) -> None:
-        if not slip_mm_s > SLIP_SHOWN_MM_S:
-            self._fill(view, tyre, TYRE)
-            return
-        strength = min(0.45 + 0.55 * slip_mm_s / SLIP_FULL_MM_S, 1.0)
-        middle = tyre.mean(axis=0)
-        away = tyre - middle
-        halo = middle + away + view.mm(2.5) * np.sign(away @ _axes(tyre)) @ _axes(tyre).T
-        self._fill(view, halo, _mixed(FLOOR, ALARM, 0.45 * strength))
-        self._fill(view, tyre, _mixed(TYRE, ALARM, strength))
+    def _draw_tyre(
+        self, view: View, wheel: Frame, size_mm: tuple[float, float], slip_mm_s: float
+    ) -> None:
+        """A wheel from above; one that slips glows."""
+        strength = 0.0
+        if slip_mm_s > SLIP_SHOWN_MM_S:
+            strength = min(0.45 + 0.55 * slip_mm_s / SLIP_FULL_MM_S, 1.0)
+            glow = 2 * view.mm(2.0)
+            halo = _rectangle(size_mm[0] + glow, size_mm[1] + glow)
+            self._fill(view, wheel(halo), mixed(FLOOR, ALARM, 0.5 * strength))
+        self._fill(view, wheel(_rectangle(*size_mm)), mixed(TYRE, ALARM, strength))
 
     def _draw_ghost(self, view: View, scene: Scene, i: int) -> None:
-        place = scene.ghost_x_mm[i], scene.ghost_y_mm[i]
-        if i == 0 or not view.shows(view.px(np.array(place)), 0):
-            return
-        at = _placement(*place, scene.ghost_theta_rad[i])
-        shapes, colour = self._shapes[i - 1], _mixed(FLOOR, self._colours[i], 0.8)
-        self._fill(view, at(shapes.ring(view.mm(1.2))), colour)
+        """The predecessor's outline one gap ago and a line to its front, in the follower's colour."""
+        robot, line = self._robots[i - 1], view.mm(1.3)
+        body = Frame(scene.ghost_x_mm[i], scene.ghost_y_mm[i], scene.ghost_theta_rad[i])
+        radius, offset = robot.outline_radius_mm, robot.outline_offset_mm
+        colour = mixed(INK, self._colours[i], 0.6)
+        self._fill(view, body.at(0, -offset)(_ring(radius, line)), colour)
+        front = body.at(0, 0.75 * radius - offset)
+        self._fill(view, front(_rectangle(line, radius / 2)), colour)
 
     def _draw_reference(self, view: View, scene: Scene, i: int) -> None:
-        place = scene.reference_x_mm[i], scene.reference_y_mm[i]
-        if not view.shows(view.px(np.array(place)), 0):
-            return
-        at = _placement(*place, scene.reference_theta_rad[i])
-        arm = 0.35 * self._robots[i].outline_radius_mm
-        for width, colour in ((view.mm(3.0), FLOOR), (view.mm(1.3), INK)):
-            for bar in _cross(arm, width):
-                self._fill(view, at(bar), colour)
+        """A cross, its arms along the reference's axes."""
+        frame = Frame(
+            scene.reference_x_mm[i], scene.reference_y_mm[i], scene.reference_theta_rad[i]
+        )
+        arm = ARM_RADII * self._robots[i].outline_radius_mm
+        for line, colour in ((view.mm(3.0), FLOOR), (view.mm(1.2), INK)):
+            for bar in _cross(arm + line / 2, line):
+                self._fill(view, frame(bar), colour)
+
+    def _draw_arrows(self, scene: Scene) -> None:
+        """An arrow and a name at the edge for every robot that is outside."""
+        view, pen = self._view, self._view.pen
+        places = view.px(np.stack([scene.x_mm, scene.y_mm], axis=-1))
+        middle = np.array([view.width / 2, view.height / 2])
+        for i in np.flatnonzero(np.isfinite(places).all(axis=-1) & ~view.shows(places)).tolist():
+            e, f = places[i] - middle
+            tip = np.clip(places[i], 5 * pen, 2 * middle - 5 * pen)
+            arrow = Frame(tip[0], tip[1], math.atan2(-e, f))
+            shape = np.array([[0.0, 0.0], [-7.0, -16.0], [7.0, -16.0]]) * pen
+            self._pg.draw.polygon(self._canvas, self._colours[i], arrow(shape).tolist())
+            room = np.clip(tip, 60 * pen, 2 * middle - 60 * pen)
+            name = arrow.at(0, -26 * pen)
+            self._label(f"robot_{i}", center=(float(room[0]), name.y))
 
     # Close-up
 
-    @property
-    def _close_up_px(self) -> tuple[int, int, int]:
-        """Left, top and side of the close-up in the finished picture."""
-        side, edge = round(CLOSE_UP_PX * self._unit), round(EDGE_PX * self._unit)
-        return edge, self._size_px[1] - edge - side - round(3 * LINE_PX * self._unit), side
+    def _close_up_view(self, i: int, scene: Scene) -> View:
+        u, robot = self._unit, self._robots[i]
+        side = OVERSAMPLING * round(CLOSE_UP_PX * u)
+        left = OVERSAMPLING * round(EDGE_PX * u)
+        top = self._view.height - side - OVERSAMPLING * round((EDGE_PX + 3 * LINE_PX) * u)
+        extent = CLOSE_UP_RADII * robot.outline_radius_mm
+        body = Frame(scene.x_mm[i], scene.y_mm[i], scene.theta_rad[i])
+        centre = body.at(0, -robot.outline_offset_mm)
+        corner = (centre.x - extent / 2, centre.y + extent / 2)
+        return View(left, top, side, side, corner, side / extent, CLOSE_UP_PEN * self._view.pen)
 
     def _draw_close_up(self, i: int, scene: Scene) -> None:
-        robot = self._robots[i]
-        left, top, side = (OVERSAMPLING * px for px in self._close_up_px)
-        extent = CLOSE_UP_RADII * robot.outline_radius_mm
-        centre = _placement(scene.x_mm[i], scene.y_mm[i], scene.theta_rad[i])(
-            self._shapes[i].centre
-        ).reshape(2)
-        corner = (float(centre[0]) - extent / 2, float(centre[1]) + extent / 2)
-        view = View(left, top, side, side, corner, side / extent, 1.3 * self._view.pen)
+        view = self._close_up_view(i, scene)
         self._canvas.set_clip(view.rect)
-        self._draw_floor(view, 0.1)
+        step_mm = round_length(CLOSE_UP_RADII * self._robots[i].outline_radius_mm / 5)
+        self._draw_floor(view, step_mm)
         self._draw_robots(view, scene)
+        self._draw_scale_bar(view, step_mm)
+        self._label(
+            f"robot_{i}", topleft=(view.left + 6 * self._view.pen, view.top + 6 * self._view.pen)
+        )
         self._canvas.set_clip(None)
-        self._pg.draw.rect(self._canvas, _mixed(FLOOR, INK, 0.5), view.rect, OVERSAMPLING)
+        self._pg.draw.rect(self._canvas, mixed(FLOOR, INK, 0.5), view.rect, OVERSAMPLING)
 
     def _draw_legend(self) -> None:
-        pass
+        """What the marks mean, under the close-up."""
+        pen = self._view.pen
+        x, y = (EDGE_PX + 8) * pen, self._view.height - (EDGE_PX + 2.3 * LINE_PX) * pen
+        flat = View(0, 0, 1, 1, (0.0, 0.0), 1.0, pen)
+        rows = ["its reference", "a slipping wheel", "its predecessor one gap ago"]
+        for row, text in enumerate(rows[: 2 if len(self._robots) == 1 else 3]):
+            mark = Frame(x, -(y + row * LINE_PX * pen), 0.0)
+            if row == 0:
+                for bar in _cross(6 * pen, 1.3 * pen):
+                    self._fill(flat, mark(bar), INK)
+            elif row == 1:
+                self._fill(flat, mark(_rectangle(8 * pen, 13 * pen)), mixed(FLOOR, ALARM, 0.5))
+                self._fill(flat, mark(_rectangle(4 * pen, 9 * pen)), ALARM)
+            else:
+                self._fill(flat, mark(_ring(6 * pen, 1.5 * pen)), mixed(INK, self._colours[1], 0.6))
+            self._label(text, midleft=(x + 12 * pen, -mark.y))
 
     # Text
 
     def _write(self, scene: Scene) -> None:
-        edge, line = EDGE_PX * self._unit, LINE_PX * self._unit
-        self._frame.blit(self._time_font.render(f"t = {scene.t_s:.2f} s", True, INK), (edge, edge))
-        y = edge + 1.6 * line
-        for i, _ in enumerate(self._robots):
-            self._write_robot(scene, i, y)
-            y += line
+        u = self._unit
+        time = self._time_font.render(f"t = {scene.t_s:.2f} s", True, INK)
+        self._picture.blit(time, (EDGE_PX * u, EDGE_PX * u))
+        top, bottom = (EDGE_PX + 1.7 * LINE_PX) * u, self._size_px[1] - EDGE_PX * u
+        if self._focus is not None:
+            bottom -= (CLOSE_UP_PX + 4 * LINE_PX) * u
+        rows = max(int((bottom - top) / (LINE_PX * u)), 1)
+        for i in range(min(len(self._robots), rows)):
+            self._write_robot(scene, i, top + i * LINE_PX * u)
 
     def _write_robot(self, scene: Scene, i: int, y: float) -> None:
-        u, edge = self._unit, EDGE_PX * self._unit
-        self._pg.draw.aacircle(self._frame, self._colours[i], (edge + 5 * u, y + 6 * u), 5 * u)
-        columns = [(f"robot_{i}", 18, "left"), (f"{scene.position_error_mm[i]:.1f} mm", 140, "right")]
-        if i > 0:
-            columns.append((f"{scene.time_gap_error_s[i]:+.3f} s", 205, "right"))
-        for text, x, side in columns:
-            image = self._font.render(text, True, INK)
-            self._frame.blit(image, image.get_rect(**{f"top{side}": (edge + x * u, y)}))
+        """One line: colour, name, position error, time-gap error, what has happened."""
+        x, u = EDGE_PX * self._unit, self._unit
+        self._pg.draw.aacircle(self._picture, self._colours[i], (x + 5 * u, y + 6 * u), 5 * u)
+        gap = f"{scene.time_gap_error_s[i]:+.3f} s" if i > 0 else ""
+        flags = [name for name in ("lost", "touched") if getattr(scene, name)[i]]
+        texts = (f"robot_{i}", _length_text(scene.position_error_mm[i]), gap, ", ".join(flags))
+        sides = ("topleft", "topright", "topright", "topleft")
+        for text, column, side in zip(texts, COLUMNS_PX, sides, strict=True):
+            image = self._font.render(text, True, ALARM if column == COLUMNS_PX[-1] else INK)
+            self._picture.blit(image, image.get_rect(**{side: (x + column * u, y)}))
 
     # Shapes
 
     def _fill(self, view: View, points_mm: np.ndarray, colour: Colour) -> None:
         self._pg.draw.polygon(self._canvas, colour, view.px(points_mm).tolist())
 
-    def _ribbons(self, view: View, points_mm: np.ndarray, width_mm: np.ndarray, colour: Any) -> None:
-        """Lines through ``(point, line, 2)``, piece by piece, in the order of the points."""
+    def _draw_lines(
+        self,
+        view: View,
+        points_mm: np.ndarray,
+        width_mm: np.ndarray,
+        colour: Callable[[int, int], Colour],
+    ) -> None:
+        """Lines through ``(point, line, 2)``, first pieces first; ``colour`` of a piece and a line."""
         along = np.gradient(points_mm, axis=0)
         length = np.linalg.norm(along, axis=-1, keepdims=True)
         along = np.divide(along, length, out=np.zeros_like(along), where=length > 0)
-        side = np.stack([-along[..., 1], along[..., 0]], axis=-1) * width_mm[:, None, None] / 2
+        side = along[..., ::-1] * (-0.5, 0.5) * width_mm[:, None, None]
         left, right = view.px(points_mm + side), view.px(points_mm - side)
         shown = view.shows(left, view.width)
-        shown = (shown[:-1] | shown[1:]) & np.isfinite(left[:-1] + left[1:]).all(axis=-1)
-        quads = np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=2)
-        polygon = self._pg.draw.polygon
-        pieces = zip(*(k.tolist() for k in np.nonzero(shown)), quads[shown].tolist(), strict=True)
-        for j, i, quad in pieces:
-            polygon(self._canvas, colour(j, i), quad)
+        pieces = np.nonzero(shown[:-1] & shown[1:])
+        quads = np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=2)[pieces]
+        polygon, canvas = self._pg.draw.polygon, self._canvas
+        for j, i, quad in zip(*(k.tolist() for k in pieces), quads.tolist(), strict=True):
+            polygon(canvas, colour(j, i), quad)
+
+
+def round_length(least: float) -> float:
+    """The smallest of 1, 2, 5, 10, 20 … that is at least this."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(digit * power for digit in (1, 2, 5, 10) if digit * power >= least)
+
+
+def mixed(of: Colour, with_: Colour, part: float) -> Colour:
+    """A colour between two others."""
+    r, g, b = (round(a + part * (c - a)) for a, c in zip(of, with_, strict=True))
+    return r, g, b
+
+
+def _grid_lines(view: View, step_mm: float, phase: float) -> tuple[list[int], list[int]]:
+    """Where the lines x and y = (k + phase)·step lie on the canvas."""
+    x_mm, y_mm = view.corner_mm
+    columns = np.arange(math.floor(x_mm / step_mm), (x_mm + view.width / view.scale) / step_mm)
+    rows = np.arange(
+        math.floor(y_mm / step_mm), (y_mm - view.height / view.scale) / step_mm - 1, -1
+    )
+    x = view.left + ((columns + phase) * step_mm - x_mm) * view.scale
+    y = view.top + (y_mm - (rows + phase) * step_mm) * view.scale
+    return x.astype(int).tolist(), y.astype(int).tolist()
+
+
+def _rectangle(width: float, length: float) -> np.ndarray:
+    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, length / 2)
+
+
+def _cross(arm: float, width: float) -> tuple[np.ndarray, np.ndarray]:
+    return _rectangle(2 * arm, width), _rectangle(width, 2 * arm)
+
+
+def _ring(radius: float, width: float) -> np.ndarray:
+    """A circle's line as one polygon: round outside, and back inside."""
+    return np.concatenate([(radius + width / 2) * CIRCLE, (radius - width / 2) * CIRCLE[::-1]])
+
+
+def _treads(radius_mm: float, angle: float) -> list[np.ndarray]:
+    """The marks that are on the upper side of a wheel, foreshortened; rolling moves them forwards."""
+    turns = (angle + 2 * math.pi * k / TREADS for k in range(TREADS))
+    return [
+        _rectangle(DRIVE_WHEEL_WIDTH_MM, 0.2 * radius_mm * math.cos(turn))
+        + (0, radius_mm * math.sin(turn))
+        for turn in turns
+        if math.cos(turn) > 0.1
+    ]
+
+
+def _length_text(length_mm: float) -> str:
+    return f"{length_mm:.1f} mm" if length_mm < 1000 else f"{length_mm / 1000:.2f} m"
 
 
 def _pygame() -> Any:
