@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -17,13 +17,14 @@ from tlf_env.numerics.philox import MAX_SEED
 from tlf_env.onboard.parts import Factory, part_name
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.arrays import Info, State
-from tlf_env.task.disturbance import constant_effects
+from tlf_env.task.channels import PATHS
 from tlf_env.task.formation import STATE_SCALES, Formation
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario, load_scenario
 
 Agent = str
+Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
 RENDER_MODES = ["human", "rgb_array"]
 PETTINGZOO_TEST_OPTION = "options"  # what PettingZoo's own API test passes; means nothing
 
@@ -57,6 +58,9 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         A preset's name, a YAML file, a mapping or a :class:`~tlf_env.task.scenario.Scenario`.
     render_mode
         None, ``"rgb_array"`` or ``"human"``.
+    adversary
+        Called with the environment before every step; returns ``{channel: value or one per robot}``
+        to set for that step, e.g. ``{"slip.delta_1_mm_s": 20.0}``.
     **overrides
         Fields of the scenario; ``disturbance_level`` too.
 
@@ -71,9 +75,12 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         scenario: str | Path | Mapping[str, Any] | Scenario = "infinity",
         *,
         render_mode: str | None = None,
+        adversary: Adversary | None = None,
         **overrides: Any,
     ) -> None:
         overrides, parts = separate_parts(overrides)
+        if adversary is not None:
+            overrides["adversary"] = True
         self.scenario = load_scenario(scenario, **overrides)
         self.metadata = {
             "name": f"tlf_env/{self.scenario.name}-v0",
@@ -103,7 +110,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self.state_space = gymnasium.spaces.Box(
             -np.inf, np.inf, (len(self.possible_agents) * len(State._fields),), np.float32
         )
-        self._effects = constant_effects(self.scenario.disturbance)._asdict()
+        self._adversary = adversary
         self._renderer: Any = None
         self._seed: int | None = None
         self._episode = 0
@@ -185,6 +192,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                 raise RuntimeError("call reset() before step()")
             return {}, {}, {}, {}, {}
         self._take(actions)
+        if self._adversary is not None:
+            self._formation.impose(self._adversary(self))
         self._formation.step()
         a = self._formation.arrays
         rewards = dict(zip(self.agents, a.rewards[0].tolist(), strict=True))
@@ -246,8 +255,9 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     def _infos(self) -> dict[Agent, dict[str, Any]]:
         a = self._formation.arrays
         infos: dict[Agent, dict[str, Any]] = {}
-        for agent, values, terms, lost, touched in zip(
+        for agent, applied, values, terms, lost, touched in zip(
             self.possible_agents,
+            self._formation.applied().tolist(),
             a.infos[0].tolist(),
             a.terms[0].tolist(),
             a.lost[0].tolist(),
@@ -256,7 +266,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         ):
             info: dict[str, Any] = dict(zip(Info._fields, values, strict=True))
             info["reward"] = dict(zip(RewardTerms._fields, terms, strict=True))
-            info["disturbance"] = dict(self._effects)
+            info["disturbance"] = dict(zip(PATHS, applied, strict=True))
             info["lost"], info["touched"] = lost, touched
             infos[agent] = info
         return infos
@@ -357,10 +367,11 @@ def parallel_env(
     scenario: str | Path | Mapping[str, Any] | Scenario = "infinity",
     *,
     render_mode: str | None = None,
+    adversary: Adversary | None = None,
     **overrides: Any,
 ) -> FormationParallelEnv:
     """Make the parallel environment; see :class:`FormationParallelEnv`."""
-    return FormationParallelEnv(scenario, render_mode=render_mode, **overrides)
+    return FormationParallelEnv(scenario, render_mode=render_mode, adversary=adversary, **overrides)
 
 
 def aec_env(

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pymunk
 
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.parameters import Body, RobotParameters, body_array
 from tlf_env.physics.state import Motion
 
 ITERATIONS = 20
@@ -28,20 +28,24 @@ class PymunkPlant:
     """Bodies of one formation in a :class:`pymunk.Space`; outlines are circles, contact is inelastic."""
 
     def __init__(self, robots: list[RobotParameters]) -> None:
-        self._robots = robots
-        self._rebuild()
+        self.reset(body_array(robots)[:, :, 0])
 
-    def _rebuild(self) -> None:
+    def reset(self, constants: np.ndarray) -> None:
+        """Rebuild the space for bodies with the kernel's ``constants`` (field, robot); contacts are forgotten.
+
+        A rebuilt space repeats a run bit for bit.
+        """
+        self._constants = constants.copy()
         space = pymunk.Space()
         space.iterations = ITERATIONS
         space.collision_slop = COLLISION_SLOP_MM
         space.damping = 1.0
         space.gravity = (0.0, 0.0)
         self._bodies: list[pymunk.Body] = []
-        for robot in self._robots:
-            body = pymunk.Body(robot.mass_kg, robot.body_inertia_kg_mm2)
-            ahead = robot.com_offset_mm - robot.outline_offset_mm
-            outline = pymunk.Circle(body, robot.outline_radius_mm, offset=(0.0, ahead))
+        for row in constants.T.tolist():
+            robot = Body(*row)
+            body = pymunk.Body(robot.m, robot.I)
+            outline = pymunk.Circle(body, robot.outline_radius, offset=(0.0, robot.outline_ahead))
             outline.friction = CONTACT_FRICTION
             outline.elasticity = 0.0
             space.add(body, outline)
@@ -56,10 +60,6 @@ class PymunkPlant:
         for shape in arbiter.shapes:
             if shape.body in self._number:
                 self._moved.add(self._number[shape.body])
-
-    def reset(self) -> None:
-        """Forget all contacts: a rebuilt space repeats a run bit for bit."""
-        self._rebuild()
 
     def space(self, motions: np.ndarray) -> pymunk.Space:
         """The space with its bodies where ``motions`` (field, robot, 1) has them, for drawing and queries."""
@@ -93,7 +93,7 @@ class PymunkPlant:
             motions[YAW, i, 0] = body.angular_velocity
 
     def __getstate__(self) -> dict[str, Any]:
-        return {"robots": self._robots}
+        return {"constants": self._constants}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__init__(state["robots"])  # type: ignore[misc]
+        self.reset(state["constants"])

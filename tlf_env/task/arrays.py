@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
@@ -13,11 +14,15 @@ from tlf_env.onboard.wheel_loop import WheelLoopParameters, WheelLoopState, digi
 from tlf_env.physics.parameters import body_array
 from tlf_env.physics.state import Contact, Motion
 from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
-from tlf_env.task.disturbance import Effects, constant_effects
+from tlf_env.task.channels import CHANNELS, DEAD_TIME, DROPOUT, JITTER
+from tlf_env.task.disturbance import Effects, leveled, patch_rows, signal_rows
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario
+
+# How far back a follower looks for the last message that did arrive.
+DROPOUT_PATIENCE_S = 2.0
 
 
 class Sensors(NamedTuple):
@@ -97,11 +102,17 @@ class Arrays(NamedTuple):
     bodies: np.ndarray
     wheel_loops: np.ndarray
     ekfs: np.ndarray
-    effects: np.ndarray
+    levels: np.ndarray  # (lane,) of the disturbance
+    signals: np.ndarray  # (channel, SignalRow)
+    patches: np.ndarray  # (patch, PatchRow)
     table: np.ndarray  # (step, Reference): the leader's reference at the control steps
     # physics
     motions: np.ndarray
     contacts: np.ndarray
+    processes: np.ndarray  # (channel, robot, lane): memory of Ornstein–Uhlenbeck signals
+    applied: np.ndarray  # (channel, robot, lane): the channels' values, last evaluated
+    imposed: np.ndarray  # (channel, robot, lane): set by an adversary; NaN where not
+    torques: np.ndarray  # (wheel, slot, robot, lane): ring over the longest dead time, mN·mm
     # on board, every substep
     loop_states: np.ndarray
     sensors: np.ndarray
@@ -109,9 +120,11 @@ class Arrays(NamedTuple):
     traces: np.ndarray
     kinds: np.ndarray  # (robot, lane) int64: of each robot's action
     wanted: np.ndarray  # wheel speeds asked for (rad/s), or torques (mN·mm)
+    wanted_before: np.ndarray  # those of the step before
     commands: np.ndarray  # the same, or the torques (mN·mm) of a wheel loop outside
     samples: np.ndarray  # (substep, Sample, robot, lane): what the sensors said in a control step
     # on board, every control step
+    dropped: np.ndarray  # (slot, robot, lane) bool: messages that never arrive
     messages: np.ndarray  # (Message, slot, robot, lane): ring over one gap
     observers: np.ndarray  # (x y θ, robot, lane)
     references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
@@ -142,7 +155,7 @@ class Arrays(NamedTuple):
     previews: np.ndarray  # (preview,) int64, in control steps
 
 
-read_effects = reader(Effects)
+read_effects = reader(Effects)  # from `applied`, whose first channels these are
 read_sensors = reader(Sensors)
 write_sensors = writer(Sensors)
 read_trace = reader(Trace)
@@ -154,6 +167,15 @@ def _constant(row: tuple[float, ...], robots: int, lanes: int) -> np.ndarray:
     return np.ascontiguousarray(
         np.broadcast_to(np.array(row, dtype=np.float64)[:, None, None], (len(row), robots, lanes))
     )
+
+
+def longest(scenario: Scenario, channel: int) -> float:
+    """The largest value that a channel can have; its range's end if an adversary may set it."""
+    if scenario.adversary:
+        return CHANNELS[channel].high
+    reach = scenario.disturbance.signal(CHANNELS[channel].path).reach()
+    level = scenario.disturbance.level
+    return max(leveled(CHANNELS[channel].nominal, end, level) for end in reach)
 
 
 def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays:
@@ -169,6 +191,11 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
     lookahead = max(scenario.preview_steps, default=0)
     entries = len(tracking_entries(scenario.preview_s))
 
+    dead = round(longest(scenario, DEAD_TIME) / scenario.physics_period_s)
+    late = math.ceil(longest(scenario, JITTER) / scenario.control_period_s)
+    patience = math.ceil(DROPOUT_PATIENCE_S / scenario.control_period_s)
+    ring = gap + 1 + late + (patience if longest(scenario, DROPOUT) > 0 else 0)
+
     def zeros(fields: int) -> np.ndarray:
         return np.zeros((fields, n, lanes))
 
@@ -176,19 +203,29 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         bodies=body_array(list(scenario.robot_models), lanes),
         wheel_loops=_constant(digital_wheel_loop(wheel_loop, scenario.physics_period_s), n, lanes),
         ekfs=_constant(ekf_constants(scenario.ekf), n, lanes),
-        effects=_constant(constant_effects(scenario.disturbance), n, lanes),
+        levels=np.full(lanes, scenario.disturbance.level),
+        signals=signal_rows(
+            scenario.disturbance, scenario.physics_period_s, scenario.control_period_s
+        ),
+        patches=patch_rows(scenario.disturbance),
         table=table.copy(),
         motions=zeros(len(Motion._fields)),
         contacts=zeros(len(Contact._fields)),
+        processes=zeros(len(CHANNELS)),
+        applied=_constant(tuple(channel.nominal for channel in CHANNELS), n, lanes),
+        imposed=np.full((len(CHANNELS), n, lanes), np.nan),
+        torques=np.zeros((2, dead + 1, n, lanes)),
         loop_states=zeros(len(WheelLoopState._fields)),
         sensors=zeros(len(Sensors._fields)),
         estimates=zeros(len(Estimate._fields)),
         traces=zeros(len(Trace._fields)),
         kinds=np.full((n, lanes), ACTION_KINDS[scenario.action], dtype=np.int64),
         wanted=zeros(2),
+        wanted_before=zeros(2),
         commands=zeros(2),
         samples=np.zeros((scenario.substeps, len(Sample._fields), n, lanes)),
-        messages=np.zeros((len(Message._fields), gap + 1, n, lanes)),
+        dropped=np.zeros((ring, n, lanes), dtype=np.bool_),
+        messages=np.zeros((len(Message._fields), ring, n, lanes)),
         observers=zeros(3),
         references=np.zeros((len(Reference._fields), lookahead + 1, n, lanes)),
         paths=np.zeros((2, gap + window + 1, n, lanes)),

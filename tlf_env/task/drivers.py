@@ -15,7 +15,7 @@ import numpy as np
 
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import block, driver, law
-from tlf_env.numerics.philox import normal_pair
+from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.onboard.estimator import (
     Ekf,
     Estimate,
@@ -85,11 +85,25 @@ from tlf_env.task.arrays import (
     write_sensors,
     write_trace,
 )
-from tlf_env.task.channels import POSITION_NOISE
-from tlf_env.task.disturbance import Effects
+from tlf_env.task.channels import (
+    CHANNELS,
+    COMPUTING_DELAY,
+    DEAD_TIME,
+    DROPOUT,
+    ENCODER_NOISE,
+    FIRST_CHANNEL_STREAM,
+    JITTER,
+    POSITION_NOISE,
+    RADIO_DROPOUT,
+    RADIO_JITTER,
+    STEP_CHANNELS,
+    SUBSTEP_CHANNELS,
+)
+from tlf_env.task.disturbance import Effects, wheel_factors
 from tlf_env.task.measures import distance, time_gap_error
 from tlf_env.task.observation import SensorTail, Tracking, preview_entries, scaled
 from tlf_env.task.reward import reward_terms
+from tlf_env.task.signals import SignalRow, signal_value
 
 
 class Settings(NamedTuple):
@@ -109,6 +123,8 @@ class Settings(NamedTuple):
     external_wheel_loop: bool
     external_observer: bool
     cooperative: bool  # every robot gets the formation's mean reward
+    changing: bool  # whether a channel of every substep varies within an episode
+    adversary: bool
     base: Gains  # of the twist that a residual is added to
 
 
@@ -119,6 +135,10 @@ DONE, MUST_COLLIDE = -1, -2
 # Outlines that could come closer than this within a control step are stepped through the space.
 CLOSE_MARGIN_MM = 10.0
 FASTEST_CHANGE_MM_S2 = 1500.0  # above what all three tyres can do at twice the paper's friction
+
+NOMINALS = np.array([channel.nominal for channel in CHANNELS])
+LOWS = np.array([channel.low for channel in CHANNELS])
+HIGHS = np.array([channel.high for channel in CHANNELS])
 
 NO_PUSH = Push(0.0, 0.0, 0.0)
 
@@ -158,6 +178,10 @@ def actuate_robot(
     kind: int,
     wanted_l: float,
     wanted_r: float,
+    patches: np.ndarray,
+    delayed: np.ndarray,
+    dead: int,
+    tick: int,
     kinematic: bool,
     dt: float,
 ) -> tuple[Motion, Contact, WheelLoopState, Trace]:
@@ -181,7 +205,19 @@ def actuate_robot(
         held = WheelLoopState(integral_l, lag_l, integral_r, lag_r)
     belt_l, belt_r = conveyor(effects.delta_1, effects.delta_2, body.h)
     floor = Floor(belt_l, belt_r, effects.grip, effects.grip, effects.grip)
-    motion, contact = substep(body, motion, contact, floor, NO_PUSH, torque_l, torque_r, dt)
+    if patches.shape[0] > 0:
+        on_l, on_r, on_c = wheel_factors(patches, body, motion)
+        floor = Floor(belt_l, belt_r, effects.grip * on_l, effects.grip * on_r, effects.grip * on_c)
+    given_l, given_r = torque_l, torque_r
+    slots = delayed.shape[1]
+    if slots > 1:
+        delayed[0, tick % slots], delayed[1, tick % slots] = torque_l, torque_r
+        given_l, given_r = 0.0, 0.0
+        if tick > dead:
+            given_l, given_r = delayed[0, (tick - dead) % slots], delayed[1, (tick - dead) % slots]
+    given_l *= effects.gain_l
+    given_r *= effects.gain_r
+    motion, contact = substep(body, motion, contact, floor, NO_PUSH, given_l, given_r, dt)
     at_limit = abs(torque_l) >= limit or abs(torque_r) >= limit
     return (
         advance_pose(motion, dt),
@@ -218,9 +254,19 @@ def sense_robot(
     dt: float,
 ) -> tuple[Sensors, Estimate, Trace, Sample]:
     """Encoders, position fix and estimator (of the ``kind``) after substep ``tick`` of one robot."""
-    step_l, step_r = motion.angle_l - sensors.encoder_l, motion.angle_r - sensors.encoder_r
+    read_l, read_r = motion.angle_l, motion.angle_r
+    if effects.encoder_std > 0.0:
+        noise_l, noise_r = normal_pair(seed, ENCODER_NOISE, robot, episode, tick)
+        read_l += effects.encoder_std * noise_l
+        read_r += effects.encoder_std * noise_r
+    if effects.quantum > 0.0:
+        read_l = effects.quantum * math.floor(read_l / effects.quantum)
+        read_r = effects.quantum * math.floor(read_r / effects.quantum)
+    step_l, step_r = read_l - sensors.encoder_l, read_r - sensors.encoder_r
     u_1, u_2 = odometry(step_l, step_r, body.R, body.h)
     x, y = axle_midpoint(motion, body.d)
+    x += effects.bias_x
+    y += effects.bias_y
     if effects.fix_std > 0.0:
         noise_x, noise_y = normal_pair(seed, POSITION_NOISE, robot, episode, tick)
         x += effects.fix_std * noise_x
@@ -233,7 +279,7 @@ def sense_robot(
         estimate = Estimate(true_x, true_y, motion.theta, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     forward, right = body_errors(d_x, d_y, estimate.theta)
     return (
-        Sensors(motion.angle_l, motion.angle_r, step_l / dt, step_r / dt),
+        Sensors(read_l, read_r, step_l / dt, step_r / dt),
         estimate,
         Trace(
             trace.distance + u_1,
@@ -248,6 +294,37 @@ def sense_robot(
         ),
         Sample(x, y, step_l, step_r),
     )
+
+
+@law
+def delays(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
+    """Dead time of the torques, and for how long the last action still holds, in ticks."""
+    dead = int(round(a.applied[DEAD_TIME, r, lane] / dt))
+    return dead, int(round(a.applied[COMPUTING_DELAY, r, lane] / dt))
+
+
+@block
+def evaluate(a: Arrays, lane: int, r: int, first: int, last: int, tick: int, s: Settings) -> None:
+    """Evaluate the channels from ``first`` to before ``last`` for one robot at a tick."""
+    for c in range(first, last):
+        row = SignalRow(
+            a.signals[c, 0], a.signals[c, 1], a.signals[c, 2], a.signals[c, 3], a.signals[c, 4]
+        )
+        value, a.processes[c, r, lane] = signal_value(
+            row,
+            tick,
+            s.dt,
+            a.seeds[lane],
+            FIRST_CHANNEL_STREAM + c,
+            r,
+            a.clock[lane, 2],
+            a.processes[c, r, lane],
+        )
+        value = NOMINALS[c] + a.levels[lane] * (value - NOMINALS[c])
+        value = min(max(value, LOWS[c]), HIGHS[c])
+        if s.adversary and not np.isnan(a.imposed[c, r, lane]):
+            value = a.imposed[c, r, lane]
+        a.applied[c, r, lane] = value
 
 
 @block
@@ -269,9 +346,14 @@ def take_actions(a: Arrays, s: Settings) -> int:
             if clipped:
                 a.infos[lane, r, CLIPPED] += 1.0
             a.actions[lane, r, 0], a.actions[lane, r, 1] = a_0, a_1
+            a.wanted_before[0, r, lane] = a.wanted[0, r, lane]
+            a.wanted_before[1, r, lane] = a.wanted[1, r, lane]
             a.wanted[0, r, lane], a.wanted[1, r, lane] = command(a, lane, r, s)
             a.commands[0, r, lane] = a.wanted[0, r, lane]
             a.commands[1, r, lane] = a.wanted[1, r, lane]
+            evaluate(a, lane, r, SUBSTEP_CHANNELS, STEP_CHANNELS, a.clock[lane, 0], s)
+            if s.adversary and not s.changing:
+                evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, a.clock[lane, 0], s)
             a.lost_now[lane, r] = a.touched_now[lane, r] = False
     a.traces[:] = 0.0
     return DONE
@@ -286,7 +368,7 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
         body = read_body(a.bodies, r, lane)
         loop = read_wheel_loop(a.wheel_loops, r, lane)
         ekf = read_ekf(a.ekfs, r, lane)
-        effects = read_effects(a.effects, r, lane)
+        effects = read_effects(a.applied, r, lane)
         motion = read_motion(a.motions, r, lane)
         contact = read_contact(a.contacts, r, lane)
         held = read_loop_state(a.loop_states, r, lane)
@@ -295,7 +377,16 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
         trace = read_trace(a.traces, r, lane)
         kind = a.kinds[r, lane]
         wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
+        dead, hold = delays(a, lane, r, dt)
+        delayed = a.torques[:, :, r, lane]
         for k in range(substeps):
+            if s.changing:
+                evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, first + k, s)
+                effects = read_effects(a.applied, r, lane)
+            if k == 0 and hold > 0:
+                wanted_l, wanted_r = a.wanted_before[0, r, lane], a.wanted_before[1, r, lane]
+            if k == hold:
+                wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
             motion, contact, held, trace = actuate_robot(
                 body,
                 loop,
@@ -308,6 +399,10 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
                 kind,
                 wanted_l,
                 wanted_r,
+                a.patches,
+                delayed,
+                dead,
+                first + k + 1,
                 s.kinematic,
                 dt,
             )
@@ -337,24 +432,35 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
 
 
 @driver
-def actuate(a: Arrays, s: Settings) -> None:
-    """The first half of one substep of lane 0: everything up to the plant's new velocities and poses."""
+def actuate(a: Arrays, k: int, s: Settings) -> None:
+    """The first half of substep ``k`` of lane 0: everything up to the plant's new velocities and poses."""
+    tick = a.clock[0, 0]
     for r in range(a.motions.shape[1]):
         kind = a.kinds[r, 0]
         if s.external_wheel_loop and kind != TORQUE:
             kind = EXTERNAL_TORQUE
+        if s.changing:
+            evaluate(a, 0, r, 0, SUBSTEP_CHANNELS, tick, s)
+        dead, hold = delays(a, 0, r, s.dt)
+        wanted_l, wanted_r = a.commands[0, r, 0], a.commands[1, r, 0]
+        if k < hold and kind != EXTERNAL_TORQUE:
+            wanted_l, wanted_r = a.wanted_before[0, r, 0], a.wanted_before[1, r, 0]
         motion, contact, held, trace = actuate_robot(
             read_body(a.bodies, r, 0),
             read_wheel_loop(a.wheel_loops, r, 0),
-            read_effects(a.effects, r, 0),
+            read_effects(a.applied, r, 0),
             read_motion(a.motions, r, 0),
             read_contact(a.contacts, r, 0),
             read_loop_state(a.loop_states, r, 0),
             read_sensors(a.sensors, r, 0),
             read_trace(a.traces, r, 0),
             kind,
-            a.commands[0, r, 0],
-            a.commands[1, r, 0],
+            wanted_l,
+            wanted_r,
+            a.patches,
+            a.torques[:, :, r, 0],
+            dead,
+            tick + 1,
             s.kinematic,
             s.dt,
         )
@@ -372,7 +478,7 @@ def sense(a: Arrays, k: int, s: Settings) -> None:
         sensors, estimate, trace, sample = sense_robot(
             read_body(a.bodies, r, 0),
             read_ekf(a.ekfs, r, 0),
-            read_effects(a.effects, r, 0),
+            read_effects(a.applied, r, 0),
             read_motion(a.motions, r, 0),
             read_sensors(a.sensors, r, 0),
             read_estimate(a.estimates, r, 0),
@@ -400,9 +506,29 @@ def wanted_of_formation(a: Arrays, lane: int, r: int, step: int, gap: int) -> tu
 
 
 @law
-def delayed_message(a: Arrays, lane: int, r: int, step: int, gap: int) -> Message:
-    """What robot ``r``'s predecessor broadcast one gap before a control step; at first its start."""
-    old = max(step - gap, 0) % a.messages.shape[1]
+def message_slot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> int:
+    """Where the message is that robot ``r`` uses at a control step: one gap old, or older.
+
+    Jitter makes it older by a fresh draw for each step; a message that was dropped is replaced by the
+    last one that was not. Before the first gap has passed it is the predecessor's start.
+    """
+    late = 0
+    jitter = a.applied[JITTER, r, lane]
+    if jitter > 0.0:
+        word, _, _, _ = words(a.seeds[lane], RADIO_JITTER, r, a.clock[lane, 2], step)
+        late = int(unit(word) * (jitter / s.period + 1.0))
+    slots = a.messages.shape[1]
+    now = a.clock[lane, 1]
+    sent = max(step - s.gap - late, 0)
+    while a.dropped[sent % slots, r - 1, lane] and sent > 0 and sent > now - slots + 1:
+        sent -= 1
+    return sent % slots
+
+
+@law
+def delayed_message(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
+    """What robot ``r`` hears from its predecessor for a control step."""
+    old = message_slot(a, lane, r, step, s)
     return Message(
         a.messages[0, old, r - 1, lane],
         a.messages[1, old, r - 1, lane],
@@ -420,7 +546,7 @@ def next_reference(a: Arrays, lane: int, r: int, m: int, s: Settings) -> None:
         for i in range(5):
             a.references[i, slot, r, lane] = a.table[m, i]
         return
-    delayed = delayed_message(a, lane, r, m, s.gap)
+    delayed = delayed_message(a, lane, r, m, s)
     x, y = a.observers[0, r, lane], a.observers[1, r, lane]
     theta = a.observers[2, r, lane]
     factor = smoothing(m * s.period, s.smoothing)
@@ -463,6 +589,12 @@ def broadcast(a: Arrays, lane: int, r: int, step: int, period: float) -> None:
         a.messages[i, slot, r, lane] = a.estimates[i, r, lane]
     a.messages[3, slot, r, lane] = trace.distance / period
     a.messages[4, slot, r, lane] = trace.turn / period
+    dropout = a.applied[DROPOUT, r, lane]
+    lost = False
+    if dropout > 0.0 and step > 0:
+        word, _, _, _ = words(a.seeds[lane], RADIO_DROPOUT, r, a.clock[lane, 2], step)
+        lost = unit(word) < dropout
+    a.dropped[slot, r, lane] = lost
 
 
 @block
@@ -529,7 +661,7 @@ def observe_sensors(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Non
     if r == 0:
         heard = read_reference(a, lane, r, step)
     else:
-        delayed = delayed_message(a, lane, r, step, s.gap)
+        delayed = delayed_message(a, lane, r, step, s)
         heard = Reference(delayed.x, delayed.y, delayed.theta, delayed.u_1, delayed.u_2)
     tail = SensorTail(
         step * s.period,
@@ -624,6 +756,19 @@ def look_lane(a: Arrays, lane: int, s: Settings) -> None:
     if s.cooperative:
         mean = a.rewards[lane].mean()
         a.rewards[lane, :] = mean
+
+
+@driver
+def draw_episode(a: Arrays, lane: int, s: Settings) -> None:
+    """All channels at the start of an episode; before the poses are set."""
+    for r in range(a.motions.shape[1]):
+        evaluate(a, lane, r, 0, a.signals.shape[0], 0, s)
+
+
+@driver
+def draw_normals(a: Arrays, lane: int, stream: int, r: int, index: int) -> tuple[float, float]:
+    """Two standard normal numbers of a robot's stream in this episode."""
+    return normal_pair(a.seeds[lane], stream, r, a.clock[lane, 2], index)
 
 
 @driver

@@ -10,10 +10,23 @@ import pymunk
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import Factory
 from tlf_env.onboard.tracking import gains_row, tracking_gains
+from tlf_env.physics.parameters import body
 from tlf_env.physics.pymunk_plant import PymunkPlant
 from tlf_env.physics.state import Motion
 from tlf_env.task import drivers
 from tlf_env.task.arrays import Arrays, make_arrays
+from tlf_env.task.channels import (
+    CHANNELS,
+    PATHS,
+    PAYLOAD_BEHIND,
+    PAYLOAD_INERTIA,
+    PAYLOAD_MASS,
+    START_HEADING,
+    START_POSE,
+    START_POSITION,
+    STEP_CHANNELS,
+)
+from tlf_env.task.disturbance import changes_within_episode, loaded_body
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.parts import Parts, part_factories
 from tlf_env.task.scenario import Scenario
@@ -32,6 +45,11 @@ STATE_SCALES = np.array(
 )
 
 
+PAYLOAD = [PAYLOAD_MASS, PAYLOAD_BEHIND, PAYLOAD_INERTIA]
+START_ATTEMPTS = 1000
+START_MARGIN_MM = 1.0
+
+
 class Formation:
     """State of one formation on the ``pymunk`` or ``kinematic`` plant.
 
@@ -48,6 +66,7 @@ class Formation:
         self._factories = part_factories(scenario, parts or {})
         self._parts = Parts(self._factories, scenario)
         self._settings = settings(scenario)
+        self._loaded = False
 
     @property
     def time_s(self) -> float:
@@ -86,15 +105,61 @@ class Formation:
         a.clock[0] = 0, 0, episode
         a.seeds[0] = seed
         a.table[:] = reference_table(s, phase_s) if phase_s else self._table
-        for r, pose in enumerate(start_poses(s, a.table[0]) if poses is None else poses):
+        for state in (a.processes, a.torques, a.wanted, a.wanted_before):
+            state[:] = 0.0
+        a.dropped[:] = False
+        a.imposed[:] = np.nan
+        drivers.draw_episode(a, 0, self._settings)
+        self._load()
+        poses = scattered(a, start_poses(s, a.table[0])) if poses is None else poses
+        for r, pose in enumerate(poses):
             self._place(r, *pose)
-        self.plant.reset()
+        self.plant.reset(a.bodies[:, :, 0])
         drivers.begin(a, 0, self._settings)
         self._parts.reset(a, self._settings)
         drivers.look(a, self._settings)
 
+    def _load(self) -> None:
+        """Put the payloads on."""
+        a = self.arrays
+        for r, robot in enumerate(self.scenario.robot_models):
+            payload = a.applied[PAYLOAD, r, 0]
+            if payload[0] > 0:
+                a.bodies[:, r, 0] = loaded_body(robot, payload)
+            elif self._loaded:
+                a.bodies[:, r, 0] = body(robot)
+        self._loaded = bool((a.applied[PAYLOAD[0]] > 0).any())
+
+    def impose(self, values: Mapping[str, float | np.ndarray]) -> None:
+        """Set channels for the coming control step: ``{path: value or one per robot}``.
+
+        Raises
+        ------
+        ValueError
+            for an unknown channel, one that cannot change within an episode, or a value out of range.
+        """
+        a = self.arrays
+        a.imposed[:] = np.nan
+        for path, value in values.items():
+            if path not in PATHS[:STEP_CHANNELS]:
+                raise ValueError(
+                    f"channel {path!r} cannot be set within an episode; there are "
+                    f"{', '.join(PATHS[:STEP_CHANNELS])}"
+                )
+            channel = CHANNELS[PATHS.index(path)]
+            row = np.broadcast_to(np.asarray(value, dtype=np.float64), a.imposed.shape[1:2])
+            if not ((row >= channel.low) & (row <= channel.high)).all():
+                raise ValueError(
+                    f"{path} {value!r} is out of its range, {channel.low:g} to {channel.high:g}"
+                )
+            a.imposed[PATHS.index(path), :, 0] = row
+
+    def applied(self) -> np.ndarray:
+        """The channels' last values, (robot, channel), channels as in ``PATHS``."""
+        return self.arrays.applied[:, :, 0].T
+
     def _place(self, r: int, x_mm: float, y_mm: float, theta: float) -> None:
-        a, d = self.arrays, self.scenario.robot_models[r].com_offset_mm
+        a, d = self.arrays, self.arrays.bodies[drivers.BODY_D, r, 0]
         a.motions[:4, r, 0] = x_mm + d * np.sin(theta), y_mm - d * np.cos(theta), theta, theta
         a.estimates[:3, r, 0] = x_mm, y_mm, theta
         a.observers[:, r, 0] = x_mm, y_mm, theta
@@ -132,7 +197,7 @@ class Formation:
         for k in range(s.substeps):
             self._parts.drive(a)
             before = a.motions.copy() if close else a.motions
-            drivers.actuate(a, s)
+            drivers.actuate(a, k, s)
             if close:
                 self.plant.collide(before, a.motions, s.dt)
             drivers.sense(a, k, s)
@@ -163,6 +228,8 @@ def settings(scenario: Scenario) -> drivers.Settings:
         external_wheel_loop=isinstance(scenario.wheel_loop, str),
         external_observer=isinstance(observer, str),
         cooperative=scenario.cooperative,
+        changing=changes_within_episode(scenario.disturbance),
+        adversary=scenario.adversary,
         base=gains_row(tracking_gains(scenario.residual_base)),
     )
 
@@ -182,6 +249,44 @@ def start_poses(scenario: Scenario, first: Sequence[float] | np.ndarray) -> np.n
         ],
         axis=-1,
     )
+
+
+def scattered(a: Arrays, poses: np.ndarray) -> np.ndarray:
+    """Start poses with the disturbance's scatter, each robot redrawn while its outline overlaps another's.
+
+    Raises
+    ------
+    ValueError
+        if there is no room after many tries.
+    """
+    if not a.applied[[START_POSITION, START_HEADING]].any():
+        return poses
+    out = poses.copy()
+    for r in range(len(out)):
+        spread = a.applied[START_POSITION, r, 0], a.applied[START_HEADING, r, 0]
+        for attempt in range(START_ATTEMPTS):
+            x, y = drivers.draw_normals(a, 0, START_POSE, r, 2 * attempt)
+            turn, _ = drivers.draw_normals(a, 0, START_POSE, r, 2 * attempt + 1)
+            out[r] = poses[r] + (spread[0] * x, spread[0] * y, spread[1] * turn)
+            if all(_apart(a, out, r, other) for other in range(r)):
+                break
+        else:
+            raise ValueError(
+                f"robot_{r}: no start pose without overlap in {START_ATTEMPTS} draws with "
+                f"start.position_std_mm {spread[0]:g}; it leaves too little room"
+            )
+    return out
+
+
+def _apart(a: Arrays, poses: np.ndarray, i: int, j: int) -> bool:
+    """Whether two robots' outlines are apart at given poses of c."""
+    centres, room = [], 0.0
+    for r in (i, j):
+        ahead = a.bodies[drivers.BODY_AHEAD, r, 0] - a.bodies[drivers.BODY_D, r, 0]
+        x_mm, y_mm, theta = poses[r]
+        centres.append((x_mm - ahead * np.sin(theta), y_mm + ahead * np.cos(theta)))
+        room += a.bodies[drivers.BODY_OUTLINE, r, 0]
+    return bool(np.hypot(*np.subtract(*centres)) > room + START_MARGIN_MM)
 
 
 def state_rows(a: Arrays) -> np.ndarray:

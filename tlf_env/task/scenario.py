@@ -17,7 +17,7 @@ from tlf_env.onboard.parts import PART_PATTERN
 from tlf_env.onboard.tracking import tracking_gains
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive, RobotParameters
-from tlf_env.task.disturbance import Disturbance, constant_effects
+from tlf_env.task.disturbance import Disturbance
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
 from tlf_env.task.trajectories import Trajectory
 
@@ -100,6 +100,7 @@ class Scenario(Frozen):
     observer: ObserverParameters | PartPath = ObserverParameters()
 
     disturbance: Disturbance = Disturbance()
+    adversary: bool = False  # whether something outside may set channels at every step
 
     action: Literal["twist", "wheel_speed", "torque", "residual"] = "twist"
     residual_base: str = "consistent"  # gains of the tracking law that a residual is added to
@@ -176,7 +177,12 @@ class Scenario(Frozen):
                 f"start_spacing_mm {self.start_spacing_mm} must be above {room_mm:g}, or the "
                 "robots touch at the start"
             )
-        constant_effects(self.disturbance)
+        delay = self.disturbance.signal("actuator.computing_delay_s").reach()[1]
+        if delay * self.disturbance.level > self.control_period_s:
+            raise ValueError(
+                f"actuator.computing_delay_s reaches {delay * self.disturbance.level:g}; it must be at "
+                f"most one control_period_s, {self.control_period_s}"
+            )
         tracking_gains(self.residual_base)
         if self.plant == "kinematic" and (
             self.action == "torque" or isinstance(self.wheel_loop, str)
