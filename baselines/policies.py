@@ -1,21 +1,105 @@
-"""Policies by name."""
+"""Policies by name, for the command line and the benchmark."""
 
 from __future__ import annotations
 
+from pathlib import Path
+
+from baselines.classical import FeedbackLinearisation, PurePursuit
 from baselines.reference import ReferencePolicy
 from baselines.run import Policy
+from tlf_env.onboard.parts import load_part
+from tlf_env.onboard.tracking import GAIN_PRESETS
+from tlf_env.task.actions import ACTION_SIZE
+from tlf_env.task.observation import tracking_entries
+from tlf_env.task.scenario import Scenario
 
-POLICIES = ("reference",)
+CLASSICAL = {"pure_pursuit": PurePursuit, "feedback_linearisation": FeedbackLinearisation}
 
 
-def make_policy(name: str, gains: str = "consistent") -> Policy:
-    """A policy by name; ``gains`` are those of the reference.
+def policy_names() -> list[str]:
+    """The names that need no file."""
+    return [*(f"reference:{gains}" for gains in GAIN_PRESETS), *CLASSICAL]
+
+
+def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy:
+    """A policy that fits a scenario.
+
+    Parameters
+    ----------
+    name
+        ``reference`` or ``reference:GAINS``, ``pure_pursuit``, ``feedback_linearisation``,
+        ``module:factory`` of an object with SB3's ``predict``, or the path of an SB3 ``.zip``.
+    trust
+        Allow an SB3 ``.zip``: loading one runs code that is in it.
 
     Raises
     ------
     ValueError
-        naming the policies, or the gain presets, there are.
+        for an unknown name, a file that cannot be read, an untrusted ``.zip``, or a policy whose
+        spaces do not fit the scenario.
     """
-    if name != "reference":
-        raise ValueError(f"policy {name!r} is not one of {', '.join(POLICIES)}")
-    return ReferencePolicy(gains)
+    if name.endswith(".zip"):
+        return _stable_baselines(Path(name), scenario, trust=trust)
+    head, _, tail = name.partition(":")
+    if head == "reference":
+        fits(name, scenario, action="twist", observation="tracking")
+        return ReferencePolicy(tail or "consistent")
+    if head in CLASSICAL and not tail:
+        fits(name, scenario, action="twist", observation="tracking")
+        return CLASSICAL[head](scenario.preview_s)
+    if tail:
+        policy = load_part(name)()
+        if not hasattr(policy, "predict"):
+            raise ValueError(f"policy {name!r} has no predict()")
+        return policy  # type: ignore[no-any-return]
+    raise ValueError(
+        f"policy {name!r} is not one of {', '.join(policy_names())}, module:factory, FILE.zip"
+    )
+
+
+def fits(name: str, scenario: Scenario, *, action: str, observation: str) -> None:
+    """Check that a policy's action and observation are the scenario's.
+
+    Raises
+    ------
+    ValueError
+        naming both.
+    """
+    if (scenario.action, scenario.observation) != (action, observation):
+        raise ValueError(
+            f"policy {name!r} takes {observation!r} observations and gives {action!r} actions; the "
+            f"scenario has {scenario.observation!r} and {scenario.action!r}"
+        )
+
+
+def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
+    if not trust:
+        raise ValueError(
+            f"{path}: loading an SB3 file runs code that is in it; --trust says that you want that"
+        )
+    if not path.is_file():
+        raise ValueError(f"cannot read {path}: no such file")
+    try:
+        from stable_baselines3.common.save_util import load_from_zip_file
+    except ModuleNotFoundError as error:
+        raise ValueError(f"{path} needs stable-baselines3 (pip install 'tlf-env[train]')") from error
+    import stable_baselines3
+
+    data, _, _ = load_from_zip_file(path, device="cpu")
+    algorithm = _algorithm_of(data or {}, path)
+    model = getattr(stable_baselines3, algorithm).load(path, device="cpu")
+    wanted = (len(tracking_entries(scenario.preview_s)),)
+    seen, given = model.observation_space.shape, model.action_space.shape
+    if scenario.observation == "tracking" and (seen != wanted or given != (ACTION_SIZE,)):
+        raise ValueError(
+            f"{path}: its observation has the shape {seen} and its action {given}; the scenario's "
+            f"are {wanted} and {(ACTION_SIZE,)}"
+        )
+    return model  # type: ignore[no-any-return]
+
+
+def _algorithm_of(data: dict[str, object], path: Path) -> str:
+    for key, algorithm in (("clip_range", "PPO"), ("ent_coef_optimizer", "SAC"), ("policy_delay", "TD3")):
+        if key in data:
+            return algorithm
+    raise ValueError(f"{path}: neither a PPO, SAC nor TD3 model of stable-baselines3")

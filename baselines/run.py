@@ -5,7 +5,7 @@ from __future__ import annotations
 import csv
 import json
 import platform
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -13,11 +13,13 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tlf_env.envs.parallel import FormationParallelEnv, parallel_env
+from tlf_env.envs.parallel import checked_seed
 from tlf_env.numerics.files import atomic
 from tlf_env.physics.state import Motion
-from tlf_env.task.arrays import Info
-from tlf_env.task.metrics import RobotMetrics, robot_metrics
+from tlf_env.onboard.parts import Factory
+from tlf_env.task.arrays import Arrays, Info
+from tlf_env.task.formation import Formation
+from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, string_metrics
 from tlf_env.task.scenario import Scenario
 
 REPORTED_PACKAGES = ("tlf-env", "numpy", "numba", "gymnasium", "pettingzoo", "pymunk")
@@ -57,8 +59,11 @@ RECORDED = (
     "omega_r_command_rad_s",
     "torque_l_Nmm",
     "torque_r_Nmm",
+    "torque_rms_Nmm",
+    "energy_mJ",
     "saturation_fraction",
     "slip_mm_s",
+    "slid_mm",
     "innovation_nis",
 )
 FROM_INFO = (
@@ -74,9 +79,23 @@ FROM_INFO = (
     "time_gap_error_s",
     "torque_l_Nmm",
     "torque_r_Nmm",
+    "torque_rms_Nmm",
+    "energy_mJ",
     "saturation_fraction",
     "slip_mm_s",
+    "slid_mm",
     "innovation_nis",
+)
+
+FROM_WHEELS = (
+    "castor_rad",
+    "omega_l_rad_s",
+    "omega_r_rad_s",
+    "omega_l_command_rad_s",
+    "omega_r_command_rad_s",
+)
+PSI, THETA, OMEGA_L, OMEGA_R = (
+    Motion._fields.index(name) for name in ("psi", "theta", "omega_l", "omega_r")
 )
 
 
@@ -93,8 +112,8 @@ class Record:
     t_s: np.ndarray  # (time,)
     columns: dict[str, np.ndarray]  # each (time, robot)
     leader: np.ndarray  # (time, 2): the leader's reference path, mm
-    lost: np.ndarray  # (robot,) bool, at any time
-    touched: np.ndarray  # (robot,) bool, at any time
+    lost_at_s: np.ndarray  # (robot,): when the error first passed lost_beyond_mm; infinite if never
+    touched_at_s: np.ndarray  # (robot,): when it first touched another; infinite if never
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.columns[column]
@@ -102,11 +121,15 @@ class Record:
     @property
     def robots(self) -> int:
         """How many robots."""
-        return len(self.lost)
+        return len(self.lost_at_s)
 
     def metrics(self) -> list[RobotMetrics]:
         """The summary of every robot."""
-        return robot_metrics(self.scenario, self.t_s, self.columns, self.lost, self.touched)
+        return robot_metrics(self.scenario, self.t_s, self.columns, self.lost_at_s, self.touched_at_s)
+
+    def string(self) -> StringMetrics:
+        """How errors grow along the string of robots."""
+        return string_metrics(self.scenario, self.columns, self.leader)
 
 
 def run_policy(
@@ -115,55 +138,74 @@ def run_policy(
     seed: int = 0,
     *,
     name: str = "policy",
+    parts: Mapping[str, Factory] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Record:
     """Drive a policy over the whole horizon, ends or not (``end_on=()``), and record everything.
 
     Parameters
     ----------
+    parts
+        Factories of the parts that the scenario names, where they are at hand as objects.
     progress
         Called with the steps done and the steps in all.
     """
-    env = parallel_env(scenario.model_copy(update={"end_on": ()}))
-    observations, _ = env.reset(seed=seed)
+    formation = Formation(scenario.model_copy(update={"end_on": ()}), parts)
+    formation.reset(checked_seed(seed))
+    a = formation.arrays
     n, steps = scenario.robot_count, scenario.horizon_steps
-    rows = {name: np.zeros((steps + 1, n)) for name in RECORDED}
-    _note(env, rows, 0)
+    infos = np.zeros((steps + 1, n, len(Info._fields)))
+    wheels = np.zeros((steps + 1, 5, n))  # castor angle, speeds, speeds asked for
+    lost_at_s, touched_at_s = np.full(n, np.inf), np.full(n, np.inf)
+    seen = a.sensor_observations[0] if scenario.observation == "sensor" else a.observations[0]
     state: Any = None
     start = np.ones(n, dtype=np.bool_)
+    _note(a, infos, wheels, 0)
     for k in range(1, steps + 1):
-        batch = np.stack([observations[agent] for agent in env.agents])
-        actions, state = policy.predict(batch, state, start, True)
+        actions, state = policy.predict(seen.copy(), state, start, True)
+        a.actions[0] = checked_actions(actions, a.actions.shape[1:])
         start = np.zeros(n, dtype=np.bool_)
-        observations, *_ = env.step(dict(zip(env.agents, actions, strict=True)))
-        _note(env, rows, k)
+        formation.step()
+        _note(a, infos, wheels, k)
+        if a.lost_now.any() or a.touched_now.any():
+            lost_at_s[a.lost_now[0]] = k * scenario.control_period_s
+            touched_at_s[a.touched_now[0]] = k * scenario.control_period_s
         if progress is not None:
             progress(k, steps)
-    a = env.formation.arrays
-    period_s = scenario.control_period_s
+    columns = {name: infos[:, :, Info._fields.index(name)] for name in FROM_INFO}
+    columns |= {name: wheels[:, i] for i, name in enumerate(FROM_WHEELS)}
     return Record(
         scenario=scenario,
         seed=seed,
         policy=name,
-        t_s=np.arange(steps + 1) * period_s,
-        columns=_with_functionals(rows, period_s),
+        t_s=np.arange(steps + 1) * scenario.control_period_s,
+        columns=_with_functionals(columns, scenario.control_period_s),
         leader=a.table[: steps + 1, :2].copy(),
-        lost=a.lost[0].copy(),
-        touched=a.touched[0].copy(),
+        lost_at_s=lost_at_s,
+        touched_at_s=touched_at_s,
     )
 
 
-def _note(env: FormationParallelEnv, rows: dict[str, np.ndarray], k: int) -> None:
-    a = env.formation.arrays
-    infos = a.infos[0]
-    for column in FROM_INFO:
-        rows[column][k] = infos[:, Info._fields.index(column)]
-    motion = Motion(*a.motions[:, :, 0])
-    rows["castor_rad"][k] = motion.psi - motion.theta
-    rows["omega_l_rad_s"][k] = motion.omega_l
-    rows["omega_r_rad_s"][k] = motion.omega_r
-    rows["omega_l_command_rad_s"][k] = a.wanted[0, :, 0]
-    rows["omega_r_command_rad_s"][k] = a.wanted[1, :, 0]
+def checked_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
+    """A policy's actions for all robots.
+
+    Raises
+    ------
+    ValueError
+        if their shape is wrong.
+    """
+    array = np.asarray(actions, dtype=np.float64)
+    if array.shape != shape:
+        raise ValueError(f"the policy's actions must have the shape {shape}, got {array.shape}")
+    return array
+
+
+def _note(a: Arrays, infos: np.ndarray, wheels: np.ndarray, k: int) -> None:
+    infos[k] = a.infos[0]
+    wheels[k, 0] = a.motions[PSI, :, 0] - a.motions[THETA, :, 0]
+    wheels[k, 1] = a.motions[OMEGA_L, :, 0]
+    wheels[k, 2] = a.motions[OMEGA_R, :, 0]
+    wheels[k, 3:] = a.wanted[:, :, 0]
 
 
 def _with_functionals(rows: dict[str, np.ndarray], period_s: float) -> dict[str, np.ndarray]:
@@ -193,6 +235,7 @@ def summary(record: Record) -> dict[str, Any]:
         "policy": record.policy,
         "settle_s": record.scenario.settle_s,
         "versions": versions(),
+        "string": record.string()._asdict(),
         "robots": {f"robot_{i}": metrics._asdict() for i, metrics in enumerate(record.metrics())},
     }
 

@@ -46,6 +46,9 @@ class Trace(NamedTuple):
     torque_r: float
     saturated: float  # substeps with a torque at its limit
     slip: float  # largest slip speed of a drive wheel, mm/s
+    slid: float  # mean way that the drive wheels slipped, mm
+    torque_2: float  # sum of the squared torques of both wheels, (mN·mm)²
+    work: float  # mechanical work of both motors that they put in, braking not counted, µJ
 
 
 class Sample(NamedTuple):
@@ -67,6 +70,9 @@ class Info(NamedTuple):
     slip_mm_s: float
     torque_l_Nmm: float
     torque_r_Nmm: float
+    torque_rms_Nmm: float  # of both wheels
+    energy_mJ: float  # put in by the motors in this step
+    slid_mm: float  # mean way that the drive wheels slipped in this step
     saturation_fraction: float
     innovation_nis: float
     x_mm: float

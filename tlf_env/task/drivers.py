@@ -229,10 +229,14 @@ def actuate_robot(
             trace.innovation_forward,
             trace.innovation_right,
             trace.nis,
-            trace.torque_l + torque_l,
-            trace.torque_r + torque_r,
+            trace.torque_l + given_l,
+            trace.torque_r + given_r,
             trace.saturated + (1.0 if at_limit else 0.0),
             max(trace.slip, max(contact.slip_l, contact.slip_r)),
+            trace.slid + 0.5 * (contact.slip_l + contact.slip_r) * dt,
+            trace.torque_2 + given_l * given_l + given_r * given_r,
+            trace.work
+            + (max(given_l * motion.omega_l, 0.0) + max(given_r * motion.omega_r, 0.0)) * dt,
         ),
     )
 
@@ -291,6 +295,9 @@ def sense_robot(
             trace.torque_r,
             trace.saturated,
             trace.slip,
+            trace.slid,
+            trace.torque_2,
+            trace.work,
         ),
         Sample(x, y, step_l, step_r),
     )
@@ -704,6 +711,9 @@ def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
         trace.slip,
         trace.torque_l * to_Nmm,
         trace.torque_r * to_Nmm,
+        math.sqrt(trace.torque_2 / (2.0 * s.substeps)) / MILLINEWTON_PER_NEWTON,
+        trace.work / MILLINEWTON_PER_NEWTON,
+        trace.slid,
         trace.saturated / s.substeps,
         trace.nis / s.substeps,
         x,

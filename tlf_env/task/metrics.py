@@ -1,4 +1,4 @@
-"""What a run is summed up by; formulas in ``docs/metrics.md``."""
+"""What a run is summed up by; definitions with formulas in ``docs/metrics.md``."""
 
 from __future__ import annotations
 
@@ -13,6 +13,8 @@ ERROR_CAP_MM = 500.0
 FORMATION_SETTLE_S = 5.0
 LOST_RMS_MM = 100.0
 LOST_TAIL_FRACTION = 0.3
+SCORE_UNIT_MM = 10.0
+SETTLED_MM = 20.0  # settling time: the position error stays below this
 
 
 class RobotMetrics(NamedTuple):
@@ -20,14 +22,23 @@ class RobotMetrics(NamedTuple):
 
     position_rmse_mm: float | None  # to the robot's own reference, from settle_s on
     position_max_mm: float | None
+    cross_track_rmse_mm: float | None  # the part of the error across the reference's heading
+    along_track_rmse_mm: float | None
     formation_rmse_mm: float | None  # to ref(t − i·gap), from t ≥ i·gap + 5 s on
+    settled_formation_rmse_mm: float | None  # the same from settle_s on
     error_capped_mean_mm: float  # mean over the whole run of min(position error, 500)
     heading_rmse_rad: float | None
     time_gap_rmse_s: float | None  # followers only
+    settling_time_s: float | None  # from when on the position error stays below 20 mm
     J_mm_s: float  # eq. (54) at the end
     J_theta_rad_s: float
+    torque_rms_Nmm: float
+    energy_J: float
     saturation_fraction: float  # of all substeps
     slip_max_mm_s: float
+    slip_distance_mm: float
+    nearest_mm: float | None  # smallest distance to another robot's axle midpoint
+    score: float  # 0 to 100
     lost: bool
     touched: bool
 
@@ -41,37 +52,161 @@ def robot_metrics(
     scenario: Scenario,
     t_s: np.ndarray,
     columns: Mapping[str, np.ndarray],
-    lost: np.ndarray,
-    touched: np.ndarray,
+    lost_at_s: np.ndarray,
+    touched_at_s: np.ndarray,
 ) -> list[RobotMetrics]:
     """Metrics of every robot from a run's columns, each ``(time, robot)``.
 
-    A robot is lost if its error passed ``lost_beyond_mm`` at any time, or if its RMS over the last
-    30 % is above 100 mm.
+    ``lost_at_s`` and ``touched_at_s`` ``(robot,)`` tell when a robot's error first passed
+    ``lost_beyond_mm`` and when it first touched another, infinity if never. A robot is also lost if
+    its RMS over the last 30 % is above 100 mm.
     """
     settled = t_s >= scenario.settle_s
     tail = t_s >= (1 - LOST_TAIL_FRACTION) * scenario.horizon_s
-    after_start = t_s > 0
+    nearest = nearest_mm(columns)
     out = []
-    for i in range(len(lost)):
+    for i in range(len(lost_at_s)):
         error = columns["position_error_mm"][:, i]
+        along, across = track_errors(columns, i)
         in_formation = t_s >= i * scenario.time_gap_s + FORMATION_SETTLE_S
+        formation = columns["formation_error_mm"][:, i]
+        gapped = settled & (t_s >= scenario.time_gap_s)
         tail_rms = rms(error[tail])
-        gap = rms(columns["time_gap_error_s"][settled & (t_s >= scenario.time_gap_s), i])
+        end_s = min(float(lost_at_s[i]), float(touched_at_s[i]))
         out.append(
             RobotMetrics(
                 position_rmse_mm=rms(error[settled]),
                 position_max_mm=float(error[settled].max()) if settled.any() else None,
-                formation_rmse_mm=rms(columns["formation_error_mm"][in_formation, i]),
+                cross_track_rmse_mm=rms(across[settled]),
+                along_track_rmse_mm=rms(along[settled]),
+                formation_rmse_mm=rms(formation[in_formation]),
+                settled_formation_rmse_mm=rms(formation[settled & in_formation]),
                 error_capped_mean_mm=float(np.minimum(error, ERROR_CAP_MM).mean()),
                 heading_rmse_rad=rms(columns["heading_error_rad"][settled, i]),
-                time_gap_rmse_s=gap if i > 0 else None,
+                time_gap_rmse_s=rms(columns["time_gap_error_s"][gapped, i]) if i > 0 else None,
+                settling_time_s=settling_time_s(t_s, error),
                 J_mm_s=float(columns["J_mm_s"][-1, i]),
                 J_theta_rad_s=float(columns["J_theta_rad_s"][-1, i]),
-                saturation_fraction=float(columns["saturation_fraction"][after_start, i].mean()),
+                torque_rms_Nmm=rms(columns["torque_rms_Nmm"][1:, i]) or 0.0,
+                energy_J=float(columns["energy_mJ"][:, i].sum()) / 1000,
+                saturation_fraction=float(columns["saturation_fraction"][1:, i].mean()),
                 slip_max_mm_s=float(columns["slip_mm_s"][:, i].max()),
-                lost=bool(lost[i]) or (tail_rms is not None and tail_rms > LOST_RMS_MM),
-                touched=bool(touched[i]),
+                slip_distance_mm=float(columns["slid_mm"][:, i].sum()),
+                nearest_mm=nearest[i],
+                score=score(t_s, formation, end_s),
+                lost=bool(np.isfinite(lost_at_s[i]))
+                or (tail_rms is not None and tail_rms > LOST_RMS_MM),
+                touched=bool(np.isfinite(touched_at_s[i])),
             )
         )
     return out
+
+
+def track_errors(columns: Mapping[str, np.ndarray], i: int) -> tuple[np.ndarray, np.ndarray]:
+    """Error of robot ``i`` along and across its reference's heading, robot − reference, mm."""
+    d_x = columns["x_mm"][:, i] - columns["reference_x_mm"][:, i]
+    d_y = columns["y_mm"][:, i] - columns["reference_y_mm"][:, i]
+    theta = columns["reference_theta_rad"][:, i]
+    sin, cos = np.sin(theta), np.cos(theta)
+    return -sin * d_x + cos * d_y, cos * d_x + sin * d_y
+
+
+def settling_time_s(t_s: np.ndarray, error: np.ndarray) -> float | None:
+    """The time from which on the error stays below 20 mm; None if it does not."""
+    outside = np.flatnonzero(error >= SETTLED_MM)
+    if not outside.size:
+        return float(t_s[0])
+    return float(t_s[outside[-1] + 1]) if outside[-1] + 1 < len(t_s) else None
+
+
+def score(t_s: np.ndarray, formation_error_mm: np.ndarray, end_s: float) -> float:
+    """100 × mean over time of 1/(1 + formation error/10 mm), 0 from the moment of lost or touched."""
+    points = 1 / (1 + formation_error_mm / SCORE_UNIT_MM)
+    return float(100 * np.where(t_s < end_s, points, 0.0).mean())
+
+
+def nearest_mm(columns: Mapping[str, np.ndarray]) -> list[float | None]:
+    """Each robot's smallest distance to another, between axle midpoints; None if alone."""
+    x, y = columns["x_mm"], columns["y_mm"]
+    robots = x.shape[1]
+    if robots == 1:
+        return [None]
+    smallest = np.full(robots, np.inf)
+    for i in range(robots):
+        for j in range(i):
+            least = float(np.hypot(x[:, i] - x[:, j], y[:, i] - y[:, j]).min())
+            smallest[i], smallest[j] = min(smallest[i], least), min(smallest[j], least)
+    return smallest.tolist()
+
+
+class StringMetrics(NamedTuple):
+    """How errors grow along the string, worst pair of neighbours; None where undefined.
+
+    A gain up to 1 means that no follower makes more of its predecessor's error.
+    """
+
+    time_gain: float | None  # largest ratio of the followers' RMS formation error to the predecessor's
+    frequency_gain: float | None  # largest gain of the error's spectrum between neighbours
+    frequency_Hz: float | None  # where that is
+
+
+MIN_COHERENCE = 0.5
+MAX_FREQUENCY_HZ = 1.0  # above, the errors are sensor noise
+SEGMENT_S = 20.0
+
+
+def string_metrics(
+    scenario: Scenario, columns: Mapping[str, np.ndarray], leader: np.ndarray
+) -> StringMetrics:
+    """String stability: deviations from the leader's reference path, across it, robot against robot.
+
+    ``leader`` ``(time, 2)`` is the leader's reference, mm. Robot i's deviation at t is taken from
+    ref(t − i·gap), and compared with its predecessor's at t − gap: the same place of the path. The
+    frequency gain is |S_xy|/S_xx (Welch, 20 s segments) up to 1 Hz where the coherence is at least
+    0.5. Counted from ``settle_s`` on.
+    """
+    from scipy.signal import coherence, csd, welch
+
+    first = round(scenario.settle_s / scenario.control_period_s)
+    steps, robots = columns["x_mm"].shape
+    across = [
+        deviation_mm(columns, leader, i, i * scenario.gap_steps) for i in range(robots)
+    ]
+    gains: list[float] = []
+    peaks: list[tuple[float, float]] = []
+    for i in range(1, robots):
+        start = max(first - (i - 1) * scenario.gap_steps, 0)
+        mine = across[i][start : steps - i * scenario.gap_steps]
+        theirs = across[i - 1][start : start + len(mine)]
+        ahead, behind = rms(theirs), rms(mine)
+        if not ahead or not behind:
+            continue
+        gains.append(behind / ahead)
+        options = {
+            "fs": 1 / scenario.control_period_s,
+            "nperseg": min(len(mine), round(SEGMENT_S / scenario.control_period_s)),
+        }
+        frequency, cross = csd(theirs, mine, **options)
+        power, alike = welch(theirs, **options)[1], coherence(theirs, mine, **options)[1]
+        usable = (power > 0) & (alike >= MIN_COHERENCE)
+        usable &= (frequency > 0) & (frequency <= MAX_FREQUENCY_HZ)
+        if usable.any():
+            gain = np.abs(cross[usable]) / power[usable]
+            peak = int(np.argmax(gain))
+            peaks.append((float(gain[peak]), float(frequency[usable][peak])))
+    top = max(peaks, default=(None, None))
+    return StringMetrics(max(gains, default=None), top[0], top[1])
+
+
+def deviation_mm(
+    columns: Mapping[str, np.ndarray], leader: np.ndarray, robot: int, lag: int
+) -> np.ndarray:
+    """Signed distance of a robot across the leader's path, by the path's own time, ``(time − lag,)``."""
+    x, y = columns["x_mm"][lag:, robot], columns["y_mm"][lag:, robot]
+    path = leader[: len(x)]
+    if len(path) < 2:
+        return np.zeros(len(path))
+    tangent = np.gradient(path, axis=0)
+    length = np.hypot(tangent[:, 0], tangent[:, 1])
+    moved = tangent[:, 0] * (y - path[:, 1]) - tangent[:, 1] * (x - path[:, 0])
+    return np.divide(moved, length, out=np.zeros_like(moved), where=length > 0)

@@ -1,0 +1,327 @@
+"""Tables from finished episodes: rates, medians and interquartile means, each with an interval.
+
+The statistics follow Agarwal et al., "Deep reinforcement learning at the edge of the statistical
+precipice", NeurIPS 2021: interquartile means, stratified bootstrap (seeds are resampled within each
+task and disturbance), performance profiles, and the probability of improvement.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from arch.bootstrap import IIDBootstrap, IndependentSamplesBootstrap
+from scipy.stats import binomtest, trim_mean
+
+from baselines.bench import Results
+from tlf_env.numerics.files import atomic
+
+REPEATS = 2000
+LEVEL = 0.95
+BOOTSTRAP_SEED = 20_000
+PROFILE_SCORES = np.linspace(0, 100, 101)
+REFERENCE = "reference:consistent"
+LOSSES = (0.05, 0.5)
+
+Stratum = tuple[str, str, float | None]  # task, disturbance, value of the swept knob
+
+
+def interquartile_mean(values: np.ndarray) -> float:
+    """Mean of the middle half."""
+    return float(trim_mean(np.ravel(values), 0.25))
+
+
+def interval(values: np.ndarray, statistic: Callable[[np.ndarray], float]) -> list[float] | None:
+    """Bootstrap interval of a statistic of one sample, None of fewer than two values."""
+    if len(values) < 2:
+        return None
+    bootstrap = IIDBootstrap(values, seed=BOOTSTRAP_SEED)
+    found = bootstrap.conf_int(statistic, REPEATS, method="percentile", size=LEVEL)
+    return [float(found[0, 0]), float(found[1, 0])]
+
+
+def stratified_interval(
+    strata: Sequence[np.ndarray], statistic: Callable[..., float]
+) -> list[float] | None:
+    """Bootstrap interval of a statistic of several samples, each resampled by itself."""
+    if not strata or min(len(values) for values in strata) < 2:
+        return None
+    bootstrap = IndependentSamplesBootstrap(*strata, seed=BOOTSTRAP_SEED)
+    found = bootstrap.conf_int(statistic, REPEATS, method="percentile", size=LEVEL)
+    return [float(found[0, 0]), float(found[1, 0])]
+
+
+def rate(events: int, runs: int) -> dict[str, Any]:
+    """A share with its Wilson interval."""
+    ends = binomtest(events, runs).proportion_ci(LEVEL, method="wilson")
+    return {"count": events, "share": events / runs, "interval": [float(ends.low), float(ends.high)]}
+
+
+def worst(line: dict[str, Any], metric: str) -> float:
+    """A run's value of a metric at its worst robot; infinite if undefined for all."""
+    values = [robot[metric] for robot in line["robots"] if robot[metric] is not None]
+    return float(max(values, default=math.inf))
+
+
+def run_score(line: dict[str, Any]) -> float:
+    """A run's score: the mean over its robots, 0 to 100."""
+    return float(np.mean([robot["score"] for robot in line["robots"]]))
+
+
+def cell_table(lines: list[dict[str, Any]]) -> dict[str, Any]:
+    """Summary of the runs of one policy in one stratum."""
+    runs = len(lines)
+    lost = sum(any(robot["lost"] for robot in line["robots"]) for line in lines)
+    touched = sum(any(robot["touched"] for robot in line["robots"]) for line in lines)
+    failed = sum(
+        any(robot["lost"] or robot["touched"] for robot in line["robots"]) for line in lines
+    )
+    table: dict[str, Any] = {
+        "runs": runs,
+        "lost": rate(lost, runs),
+        "touched": rate(touched, runs),
+        "success": rate(runs - failed, runs),
+    }
+    for metric in (
+        "position_rmse_mm",
+        "settled_formation_rmse_mm",
+        "error_capped_mean_mm",
+        "torque_rms_Nmm",
+    ):
+        values = np.array([worst(line, metric) for line in lines])
+        table[metric] = {"median": float(np.median(values)), "interval": interval(values, _median)}
+    scores = np.array([run_score(line) for line in lines])
+    table["score"] = {
+        "iqm": interquartile_mean(scores),
+        "interval": interval(scores, interquartile_mean),
+    }
+    gains = [line["string"]["time_gain"] for line in lines if line["string"]["time_gain"] is not None]
+    table["string_time_gain"] = float(np.median(gains)) if gains else None
+    return table
+
+
+def _median(values: np.ndarray) -> float:
+    return float(np.median(values))
+
+
+def stratum_of(line: dict[str, Any]) -> Stratum:
+    """Task, disturbance and swept value of a line."""
+    return line["task"], line["disturbance"], line["sweep"]
+
+
+def leaderboard(results: Results) -> dict[str, Any]:
+    """Everything that the tables and figures show, from the finished lines in the plan's order."""
+    groups: dict[str, dict[Stratum, list[dict[str, Any]]]] = {}
+    for line in results.ordered():
+        groups.setdefault(line["policy"], {}).setdefault(stratum_of(line), []).append(line)
+    reference = REFERENCE if REFERENCE in groups else next(iter(groups), None)
+    cells = [
+        {
+            "policy": policy,
+            "task": stratum[0],
+            "disturbance": stratum[1],
+            "sweep": stratum[2],
+            "privileged": lines[0]["privileged"],
+            **cell_table(lines),
+        }
+        for policy, strata in groups.items()
+        for stratum, lines in strata.items()
+    ]
+    policies = [
+        policy_table(policy, groups[policy], groups[reference] if reference else {})
+        for policy in groups
+    ]
+    policies.sort(key=lambda row: -row["score"]["iqm"])
+    return {
+        "reference": reference,
+        "plan": json.loads((results.folder / "plan.json").read_text(encoding="utf-8")),
+        "policies": policies,
+        "cells": cells,
+        "profiles": {policy: profile(strata) for policy, strata in groups.items()},
+        "breaking_points": breaking_points(results, cells),
+    }
+
+
+def policy_table(
+    policy: str,
+    strata: dict[Stratum, list[dict[str, Any]]],
+    reference: dict[Stratum, list[dict[str, Any]]],
+) -> dict[str, Any]:
+    """One policy over all strata."""
+    scores = [np.array([run_score(line) for line in lines]) for lines in strata.values()]
+    theirs = [np.array([run_score(line) for line in lines]) for lines in reference.values()]
+    base = pooled_iqm(*theirs) if theirs else math.nan
+    better = [
+        improvement(mine, other)
+        for mine, other in zip(scores, theirs, strict=False)
+        if len(mine) == len(other)
+    ]
+    failed = [
+        any(robot["lost"] or robot["touched"] for robot in line["robots"])
+        for lines in strata.values()
+        for line in lines
+    ]
+    own = pooled_iqm(*scores)
+    return {
+        "policy": policy,
+        "privileged": any(line["privileged"] for lines in strata.values() for line in lines),
+        "runs": len(failed),
+        "failed": sum(failed),
+        "score": {"iqm": own, "interval": stratified_interval(scores, pooled_iqm)},
+        "normalised_score": own / base if base else None,
+        "probability_of_improvement": float(np.mean(better)) if better else None,
+    }
+
+
+def pooled_iqm(*strata: np.ndarray) -> float:
+    """Interquartile mean of all values together."""
+    return interquartile_mean(np.concatenate(strata))
+
+
+def improvement(mine: np.ndarray, theirs: np.ndarray) -> float:
+    """Probability that a run of mine scores higher than one of theirs; ties count half."""
+    difference = mine[:, None] - theirs[None, :]
+    return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
+
+
+def profile(strata: dict[Stratum, list[dict[str, Any]]]) -> list[float]:
+    """Share of runs above each of :data:`PROFILE_SCORES`, every stratum weighing the same."""
+    shares = [
+        [(np.array([run_score(line) for line in lines]) > level).mean() for level in PROFILE_SCORES]
+        for lines in strata.values()
+    ]
+    return np.mean(shares, axis=0).tolist()
+
+
+def breaking_points(results: Results, cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """Where along a sweep a policy loses 5 % and 50 % of its runs, interpolated; None if it does not."""
+    if results.plan.sweep is None:
+        return []
+    out = []
+    for policy in results.plan.policies:
+        for task in results.plan.tasks:
+            for disturbance in results.plan.disturbances:
+                mine = [
+                    cell
+                    for cell in cells
+                    if (cell["policy"], cell["task"], cell["disturbance"]) == (policy, task, disturbance)
+                ]
+                mine.sort(key=lambda cell: cell["sweep"])
+                failed = [1 - cell["success"]["share"] for cell in mine]
+                values = [cell["sweep"] for cell in mine]
+                row = {"policy": policy, "task": task, "disturbance": disturbance}
+                for share in LOSSES:
+                    row[f"loses_{100 * share:g}_percent_at"] = crossing(values, failed, share)
+                out.append(row)
+    return out
+
+
+def crossing(values: Sequence[float], shares: Sequence[float], level: float) -> float | None:
+    """The first value at which a share reaches a level, interpolated between neighbours."""
+    for i, share in enumerate(shares):
+        if share >= level:
+            if i == 0:
+                return float(values[0])
+            part = (level - shares[i - 1]) / (share - shares[i - 1])
+            return float(values[i - 1] + part * (values[i] - values[i - 1]))
+    return None
+
+
+def write_leaderboard(results: Results, folder: Path, command: str) -> dict[str, Any]:
+    """Write ``leaderboard.json`` and ``leaderboard.md``; returns what the first holds."""
+    board = leaderboard(results)
+    with atomic(folder / "leaderboard.json", encoding="utf-8") as file:
+        json.dump(board, file, indent=1, allow_nan=False)
+        file.write("\n")
+    with atomic(folder / "leaderboard.md", encoding="utf-8") as file:
+        file.write(markdown(board, command))
+    return board
+
+
+def markdown(board: dict[str, Any], command: str) -> str:
+    """The tables as Markdown."""
+    plan = board["plan"]["plan"]
+    first, end = plan["seeds"]
+    parts = [
+        "# Leaderboard\n",
+        f"Made by `{command}`: seeds {first} to {end - 1}, the same draws for every policy. "
+        "Intervals are 95 %, by stratified bootstrap (shares: Wilson). A run fails if a robot is lost or "
+        "touches another. Definitions: `docs/metrics.md`.\n",
+        "## Over all tasks and disturbances\n",
+        "| policy | score (IQM) | interval | normalised | better than the reference | failed |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for row in board["policies"]:
+        parts.append(
+            f"| {title(row)} | {row['score']['iqm']:.1f} | {span(row['score']['interval'], 1)} | "
+            f"{number(row['normalised_score'], 2)} | {number(row['probability_of_improvement'], 2)} | "
+            f"{row['failed']} of {row['runs']} |"
+        )
+    parts.append("")
+    tasks = dict.fromkeys(cell["task"] for cell in board["cells"])
+    for task in tasks:
+        parts += task_tables(board, task)
+    if board["breaking_points"]:
+        parts += [
+            "## Where policies break\n",
+            f"Value of `{plan['sweep']}` at which a policy fails in 5 % and in 50 % of its runs.\n",
+            "| policy | task | disturbance | 5 % | 50 % |",
+            "|---|---|---|---:|---:|",
+        ]
+        for row in board["breaking_points"]:
+            parts.append(
+                f"| {row['policy']} | {row['task']} | {row['disturbance']} | "
+                f"{number(row['loses_5_percent_at'], 3)} | {number(row['loses_50_percent_at'], 3)} |"
+            )
+        parts.append("")
+    return "\n".join(parts)
+
+
+def task_tables(board: dict[str, Any], task: str) -> list[str]:
+    """A table of one task: a row per disturbance and policy."""
+    parts = [
+        f"## {task}\n",
+        "RMS: worst robot from 40 % of the horizon on, median over seeds; capped: mean of "
+        "min(error, 500 mm) over the whole run.\n",
+        "| disturbance | policy | lost | touched | position RMS mm | formation RMS mm | capped mean mm | "
+        "torque RMS N·mm | score |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for cell in board["cells"]:
+        if cell["task"] != task:
+            continue
+        knob = "" if cell["sweep"] is None else f" = {cell['sweep']:g}"
+        figures = [
+            f"{cell[metric]['median']:.{digits}f} {span(cell[metric]['interval'], digits)}"
+            for metric, digits in (
+                ("position_rmse_mm", 1),
+                ("settled_formation_rmse_mm", 1),
+                ("error_capped_mean_mm", 1),
+            )
+        ]
+        parts.append(
+            f"| {cell['disturbance']}{knob} | {title(cell)} | {cell['lost']['count']} of {cell['runs']} "
+            f"{span([100 * x for x in cell['lost']['interval']], 0)} % | {cell['touched']['count']} | "
+            f"{' | '.join(figures)} | {cell['torque_rms_Nmm']['median']:.1f} | "
+            f"{cell['score']['iqm']:.1f} {span(cell['score']['interval'], 1)} |"
+        )
+    return [*parts, ""]
+
+
+def title(row: dict[str, Any]) -> str:
+    """A policy's name, marked if it is given the truth."""
+    return row["policy"] + (" (privileged)" if row["privileged"] else "")
+
+
+def span(ends: Sequence[float] | None, digits: int) -> str:
+    """An interval in brackets."""
+    return "" if ends is None else f"[{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
+
+
+def number(value: float | None, digits: int) -> str:
+    """A number, or a dash."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

@@ -1,0 +1,363 @@
+"""The benchmark: policies × tasks × disturbances × seeds, interrupted and resumed at will.
+
+Every policy meets the same draws: a seed fixes noise, slip and starts whatever the policy does.
+Finished episodes go to ``runs.jsonl``, a line each, flushed to disk; what is there is not run again,
+and the tables are made from the lines in a fixed order, so that neither the number of processes nor
+an interruption changes them.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import subprocess
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from dataclasses import asdict, dataclass
+from multiprocessing import get_context
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from baselines.policies import make_policy
+from baselines.run import run_policy, versions
+from tlf_env.numerics.compiled import sources_digest
+from tlf_env.numerics.files import atomic
+from tlf_env.task.scenario import Scenario, load_scenario, preset_names, presets_folder
+
+RUNS, PLAN = "runs.jsonl", "plan.json"
+FIRST_TABLE_SEED = 20_000
+IN_FLIGHT_PER_PROCESS = 4
+
+
+class Cell(NamedTuple):
+    """One episode of the table."""
+
+    policy: str
+    task: str
+    disturbance: str
+    level: float
+    sweep: float | None  # value of the swept knob
+    seed: int
+
+
+@dataclass(frozen=True)
+class Plan:
+    """What is to be run. ``overrides`` are fields of every scenario; ``sweep`` is a knob's path."""
+
+    policies: tuple[str, ...]
+    tasks: tuple[str, ...]
+    disturbances: tuple[str, ...]
+    seeds: tuple[int, int]  # first, and the one after the last
+    level: float = 1.0
+    sweep: str | None = None
+    sweep_values: tuple[float, ...] = ()
+    overrides: tuple[tuple[str, Any], ...] = ()
+    trust: bool = False
+
+    def cells(self) -> list[Cell]:
+        """All episodes in the order of the tables; seeds run slowest, so that early results cover all."""
+        values: tuple[float | None, ...] = self.sweep_values if self.sweep else (None,)
+        return [
+            Cell(policy, task, disturbance, self.level, value, seed)
+            for seed in range(*self.seeds)
+            for task in self.tasks
+            for disturbance in self.disturbances
+            for value in values
+            for policy in self.policies
+        ]
+
+    def scenario(self, cell: Cell) -> Scenario:
+        """The scenario of one episode.
+
+        Raises
+        ------
+        ValueError
+            for an unknown task, disturbance or knob, or a value out of its range.
+        """
+        overrides = dict(self.overrides)
+        disturbance: Any = cell.disturbance
+        if self.sweep is not None and cell.sweep is not None:
+            if self.sweep == "level":
+                return load_scenario(
+                    cell.task, disturbance=disturbance, disturbance_level=cell.sweep, **overrides
+                )
+            base = load_scenario(cell.task, disturbance=disturbance).disturbance.model_dump()
+            disturbance = with_value(base, self.sweep, cell.sweep)
+        return load_scenario(
+            cell.task, disturbance=disturbance, disturbance_level=cell.level, **overrides
+        )
+
+
+def with_value(tree: dict[str, Any], path: str, value: float) -> dict[str, Any]:
+    """A copy of a nested mapping with one number replaced.
+
+    Raises
+    ------
+    ValueError
+        if there is nothing at the path.
+    """
+    head, _, tail = path.partition(".")
+    if head not in tree:
+        raise ValueError(f"sweep: there is no {head!r}; there are {', '.join(sorted(tree))}")
+    if tail and not isinstance(tree[head], dict):
+        raise ValueError(f"sweep: {head!r} has no parts, got {path!r}")
+    return {**tree, head: with_value(tree[head], tail, value) if tail else value}
+
+
+def parse_sweep(text: str) -> tuple[str, tuple[float, ...]]:
+    """``path=first:last:count`` as the path and the values.
+
+    Raises
+    ------
+    ValueError
+        if it is not of that form.
+    """
+    path, _, span = text.partition("=")
+    parts = span.split(":")
+    try:
+        first, last, count = float(parts[0]), float(parts[1]), int(parts[2])
+        if len(parts) != 3 or count < 2 or not path:
+            raise ValueError
+    except (ValueError, IndexError):
+        raise ValueError(
+            f"sweep {text!r} must be PATH=FIRST:LAST:COUNT with COUNT at least 2, "
+            "e.g. slip.delta_1_mm_s=0:40:9"
+        ) from None
+    return path, tuple(first + (last - first) * i / (count - 1) for i in range(count))
+
+
+def parse_seeds(text: str) -> tuple[int, int]:
+    """``first:end`` as two numbers; ``end`` is not run.
+
+    Raises
+    ------
+    ValueError
+        if it is not of that form.
+    """
+    first, _, end = text.partition(":")
+    if not (first.isdecimal() and end.isdecimal() and int(first) < int(end)):
+        raise ValueError(f"seeds {text!r} must be FIRST:END, e.g. 20000:20050")
+    return int(first), int(end)
+
+
+def disturbance_presets() -> list[str]:
+    """Names of all disturbance presets."""
+    return preset_names(presets_folder() / "disturbances")
+
+
+def run_cell(plan: Plan, cell: Cell) -> dict[str, Any]:
+    """Run one episode; the line that it adds to ``runs.jsonl``."""
+    scenario = plan.scenario(cell)
+    policy = make_policy(cell.policy, scenario, trust=plan.trust)
+    record = run_policy(scenario, policy, cell.seed, name=cell.policy)
+    return {
+        **cell._asdict(),
+        "scenario_hash": scenario_hash(scenario),
+        "privileged": scenario.privileged or bool(getattr(policy, "privileged", False)),
+        "string": record.string()._asdict(),
+        "robots": [metrics._asdict() for metrics in record.metrics()],
+    }
+
+
+def scenario_hash(scenario: Scenario) -> str:
+    """Twelve digits that stand for everything an episode depends on but its seed."""
+    return hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()[:12]
+
+
+def git_revision() -> str | None:
+    """Revision of the source checkout that runs, with ``+`` if it has changes; None without git."""
+    here = Path(__file__).resolve().parent
+    try:
+        options = {"cwd": here, "capture_output": True, "text": True, "timeout": 10, "check": True}
+        revision = subprocess.run(["git", "rev-parse", "HEAD"], **options).stdout.strip()  # type: ignore[call-overload]
+        changes = subprocess.run(["git", "status", "--porcelain", "-uno"], **options).stdout  # type: ignore[call-overload]
+    except (OSError, subprocess.SubprocessError):
+        return None
+    return revision + ("+" if changes.strip() else "")
+
+
+def plan_record(plan: Plan) -> dict[str, Any]:
+    """What ``plan.json`` holds."""
+    hashes = {
+        f"{task}, {disturbance}": scenario_hash(
+            plan.scenario(Cell("", task, disturbance, plan.level, _first(plan.sweep_values), 0))
+        )
+        for task in plan.tasks
+        for disturbance in plan.disturbances
+    }
+    return {
+        "plan": json.loads(json.dumps(asdict(plan))),
+        "scenarios": hashes,
+        "sources": sources_digest(),
+        "versions": versions(),
+        "git_revision": git_revision(),
+    }
+
+
+def _first(values: tuple[float, ...]) -> float | None:
+    return values[0] if values else None
+
+
+class Results:
+    """The lines of finished episodes in a folder, and what is still missing.
+
+    Raises
+    ------
+    ValueError
+        if the folder holds results of another plan, or of other sources of the simulation.
+    """
+
+    def __init__(self, folder: Path, plan: Plan) -> None:
+        self.folder, self.plan = folder, plan
+        folder.mkdir(parents=True, exist_ok=True)
+        record = plan_record(plan)
+        path = folder / PLAN
+        if path.exists():
+            before = json.loads(path.read_text(encoding="utf-8"))
+            for key in ("plan", "scenarios", "sources"):
+                if before.get(key) != record[key]:
+                    raise ValueError(
+                        f"{folder} holds results of another {key}; take another --out, or remove it"
+                    )
+        else:
+            with atomic(path, encoding="utf-8") as file:
+                json.dump(record, file, indent=2)
+                file.write("\n")
+        self.lines = self._read()
+
+    def _read(self) -> dict[Cell, dict[str, Any]]:
+        """Whole lines only: what a killed writer left half written is cut off."""
+        path = self.folder / RUNS
+        if not path.exists():
+            return {}
+        data = path.read_bytes()
+        whole = data[: data.rfind(b"\n") + 1]
+        if len(whole) < len(data):
+            with atomic(path, "wb") as file:
+                file.write(whole)
+        lines: dict[Cell, dict[str, Any]] = {}
+        for text in whole.splitlines():
+            line = json.loads(text)
+            lines[Cell(*(line[name] for name in Cell._fields))] = line
+        return lines
+
+    def add(self, line: dict[str, Any]) -> None:
+        """Append one episode; it is on the disk when this returns."""
+        text = json.dumps(line, allow_nan=False) + "\n"
+        handle = os.open(self.folder / RUNS, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            os.write(handle, text.encode())
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+        self.lines[Cell(*(line[name] for name in Cell._fields))] = line
+
+    def missing(self) -> list[Cell]:
+        """Episodes that have not been run."""
+        return [cell for cell in self.plan.cells() if cell not in self.lines]
+
+    def ordered(self) -> list[dict[str, Any]]:
+        """The finished lines in the plan's order."""
+        return [self.lines[cell] for cell in self.plan.cells() if cell in self.lines]
+
+
+def run_bench(
+    plan: Plan,
+    folder: Path,
+    *,
+    processes: int = 1,
+    ray_address: str | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Results:
+    """Run what is missing of a plan, here or on a Ray cluster.
+
+    Raises
+    ------
+    ValueError
+        for a plan that cannot run, before anything is run.
+    """
+    if processes < 1:
+        raise ValueError(f"processes {processes} must be at least 1")
+    for policy in plan.policies:
+        for task in plan.tasks:
+            cell = Cell(policy, task, plan.disturbances[0], plan.level, _first(plan.sweep_values), 0)
+            make_policy(policy, plan.scenario(cell), trust=plan.trust)
+    for value in plan.sweep_values[-1:]:
+        plan.scenario(
+            Cell("", plan.tasks[0], plan.disturbances[0], plan.level, value, plan.seeds[0])
+        )
+    results = Results(folder, plan)
+    todo = results.missing()
+    total = len(plan.cells())
+    if progress is not None:
+        progress(total - len(todo), total)
+    finished: Iterable[dict[str, Any]]
+    if ray_address is not None:
+        finished = _on_ray(plan, todo, ray_address)
+    elif processes == 1:
+        finished = (run_cell(plan, cell) for cell in todo)
+    else:
+        finished = _in_processes(plan, todo, processes)
+    for line in finished:
+        results.add(line)
+        if progress is not None:
+            progress(len(results.lines), total)
+    return results
+
+
+def _in_processes(plan: Plan, cells: list[Cell], processes: int) -> Iterator[dict[str, Any]]:
+    """Results as they come; only a few episodes are handed out ahead, so that an interrupt is quick."""
+    waiting = iter(cells)
+    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
+    running: set[Future[dict[str, Any]]] = set()
+    try:
+        while True:
+            while len(running) < processes * IN_FLIGHT_PER_PROCESS:
+                cell = next(waiting, None)
+                if cell is None:
+                    break
+                running.add(pool.submit(run_cell, plan, cell))
+            if not running:
+                return
+            done, running = wait(running, return_when=FIRST_COMPLETED)
+            for future in done:
+                yield future.result()
+    finally:
+        pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _on_ray(plan: Plan, cells: list[Cell], address: str) -> Iterator[dict[str, Any]]:
+    """Results as they come from an existing Ray cluster.
+
+    Raises
+    ------
+    ValueError
+        if ray is not installed or the cluster cannot be reached.
+    """
+    try:
+        import ray
+    except ModuleNotFoundError as error:
+        raise ValueError("--ray needs ray (pip install 'tlf-env[ray]')") from error
+    try:
+        ray.init(address=address, log_to_driver=False)
+    except (ConnectionError, ValueError, RuntimeError) as error:
+        raise ValueError(f"no Ray cluster at {address!r}: {error}") from error
+    try:
+        remote = ray.remote(num_cpus=1)(run_cell)
+        shared = ray.put(plan)
+        limit = IN_FLIGHT_PER_PROCESS * max(1, int(ray.cluster_resources().get("CPU", 1)))
+        waiting = iter(cells)
+        running: list[Any] = []
+        while True:
+            while len(running) < limit:
+                cell = next(waiting, None)
+                if cell is None:
+                    break
+                running.append(remote.remote(shared, cell))
+            if not running:
+                return
+            done, running = ray.wait(running)
+            yield from ray.get(done)
+    finally:
+        ray.shutdown()

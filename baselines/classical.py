@@ -1,0 +1,106 @@
+"""Classical rivals of the paper's law, from the same ``tracking`` observation to the same ``twist``."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
+from tlf_env.task.observation import tracking_entries
+
+DEFAULT_PREVIEW_S = (0.5, 1.0)
+
+
+class _Memoryless:
+    """SB3's ``predict`` around a law from named entries (physical units) to a twist."""
+
+    privileged = False
+
+    def __init__(self, preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S) -> None:
+        entries = tracking_entries(preview_s)
+        self._places = {name: i for i, name in enumerate(entries)}
+        self._scales = np.array([entry.scale for entry in entries.values()])
+
+    def twist(self, seen: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Forward speed (mm/s) and yaw rate (rad/s) for entries ``(batch,)`` by name."""
+        raise NotImplementedError
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """``twist`` action for one ``tracking`` observation or a batch.
+
+        Raises
+        ------
+        ValueError
+            if the observation has not the entries of ``tracking`` with this policy's previews.
+        """
+        observation = np.asarray(observation)
+        if observation.ndim not in (1, 2) or observation.shape[-1] != len(self._scales):
+            raise ValueError(
+                f"the observation has the shape {observation.shape}; this policy takes tracking "
+                f"observations of {len(self._scales)} entries"
+            )
+        rows = (np.atleast_2d(observation) * self._scales).T
+        forward, turn = self.twist({name: rows[i] for name, i in self._places.items()})
+        action = np.stack([forward / FULL_SPEED_MM_S, turn / FULL_YAW_RATE_RAD_S], axis=-1)
+        action = np.clip(action, -1.0, 1.0).astype(observation.dtype)
+        return (action[0] if observation.ndim == 1 else action), state
+
+
+class PurePursuit(_Memoryless):
+    """Steer along the circle through the robot's place and its reference half a second from now.
+
+    Coulter, "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992. The
+    speed is the reference's plus ``gain_per_s`` times the error ahead.
+    """
+
+    def __init__(
+        self, preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S, gain_per_s: float = 0.23
+    ) -> None:
+        super().__init__(preview_s)
+        self.gain_per_s = gain_per_s
+        self._ahead = f"in_{preview_s[0]:g}_s"
+
+    def twist(self, seen: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """Speed and curvature of the pursuit circle, 2·lateral/distance²."""
+        forward, right = seen[f"forward_{self._ahead}"], seen[f"right_{self._ahead}"]
+        speed = seen["reference_u_1"] + self.gain_per_s * seen["e_1"]
+        distance_2 = forward**2 + right**2
+        curvature = np.divide(
+            -2.0 * right, distance_2, out=np.zeros_like(right), where=distance_2 > 1.0
+        )
+        return speed, curvature * np.abs(speed)
+
+
+class FeedbackLinearisation(_Memoryless):
+    """Input–output linearisation of a point ``ahead_mm`` in front of the axle.
+
+    Siciliano et al., "Robotics: modelling, planning and control", Springer 2009, section 11.6.2. The
+    point can be given any velocity, so that its error decays with ``gain_per_s`` in every direction.
+    """
+
+    def __init__(
+        self,
+        preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S,
+        ahead_mm: float = 150.0,
+        gain_per_s: float = 1.0,
+    ) -> None:
+        super().__init__(preview_s)
+        self.ahead_mm = ahead_mm
+        self.gain_per_s = gain_per_s
+
+    def twist(self, seen: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+        """The twist that gives the point its wanted velocity."""
+        b, sin, cos = self.ahead_mm, seen["sin_e_3"], seen["cos_e_3"]
+        u_1, u_2 = seen["reference_u_1"], seen["reference_u_2"]
+        forward = u_1 * cos - b * u_2 * sin + self.gain_per_s * (seen["e_1"] + b * (cos - 1.0))
+        right = -u_1 * sin - b * u_2 * cos + self.gain_per_s * (seen["e_2"] - b * sin)
+        return forward, -right / b
+
+
