@@ -58,7 +58,11 @@ def stratified_interval(
 def rate(events: int, runs: int) -> dict[str, Any]:
     """A share with its Wilson interval."""
     ends = binomtest(events, runs).proportion_ci(LEVEL, method="wilson")
-    return {"count": events, "share": events / runs, "interval": [float(ends.low), float(ends.high)]}
+    return {
+        "count": events,
+        "share": events / runs,
+        "interval": [float(ends.low), float(ends.high)],
+    }
 
 
 def worst(line: dict[str, Any], metric: str) -> float:
@@ -99,7 +103,9 @@ def cell_table(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "iqm": interquartile_mean(scores),
         "interval": interval(scores, interquartile_mean),
     }
-    gains = [line["string"]["time_gain"] for line in lines if line["string"]["time_gain"] is not None]
+    gains = [
+        line["string"]["time_gain"] for line in lines if line["string"]["time_gain"] is not None
+    ]
     table["string_time_gain"] = float(np.median(gains)) if gains else None
     return table
 
@@ -208,7 +214,8 @@ def breaking_points(results: Results, cells: list[dict[str, Any]]) -> list[dict[
                 mine = [
                     cell
                     for cell in cells
-                    if (cell["policy"], cell["task"], cell["disturbance"]) == (policy, task, disturbance)
+                    if (cell["policy"], cell["task"], cell["disturbance"])
+                    == (policy, task, disturbance)
                 ]
                 mine.sort(key=lambda cell: cell["sweep"])
                 failed = [1 - cell["success"]["share"] for cell in mine]
@@ -255,12 +262,12 @@ def markdown(board: dict[str, Any], command: str) -> str:
         "| policy | score (IQM) | interval | normalised | better than the reference | failed |",
         "|---|---:|---:|---:|---:|---:|",
     ]
-    for row in board["policies"]:
-        parts.append(
-            f"| {title(row)} | {row['score']['iqm']:.1f} | {span(row['score']['interval'], 1)} | "
-            f"{number(row['normalised_score'], 2)} | {number(row['probability_of_improvement'], 2)} | "
-            f"{row['failed']} of {row['runs']} |"
-        )
+    parts += [
+        f"| {title(row)} | {row['score']['iqm']:.1f} | {span(row['score']['interval'], 1)} | "
+        f"{number(row['normalised_score'], 2)} | {number(row['probability_of_improvement'], 2)} | "
+        f"{row['failed']} of {row['runs']} |"
+        for row in board["policies"]
+    ]
     parts.append("")
     tasks = dict.fromkeys(cell["task"] for cell in board["cells"])
     for task in tasks:
@@ -272,11 +279,11 @@ def markdown(board: dict[str, Any], command: str) -> str:
             "| policy | task | disturbance | 5 % | 50 % |",
             "|---|---|---|---:|---:|",
         ]
-        for row in board["breaking_points"]:
-            parts.append(
-                f"| {row['policy']} | {row['task']} | {row['disturbance']} | "
-                f"{number(row['loses_5_percent_at'], 3)} | {number(row['loses_50_percent_at'], 3)} |"
-            )
+        parts += [
+            f"| {row['policy']} | {row['task']} | {row['disturbance']} | "
+            f"{number(row['loses_5_percent_at'], 3)} | {number(row['loses_50_percent_at'], 3)} |"
+            for row in board["breaking_points"]
+        ]
         parts.append("")
     return "\n".join(parts)
 

@@ -281,7 +281,9 @@ def run_bench(
         raise ValueError(f"processes {processes} must be at least 1")
     for policy in plan.policies:
         for task in plan.tasks:
-            cell = Cell(policy, task, plan.disturbances[0], plan.level, _first(plan.sweep_values), 0)
+            cell = Cell(
+                policy, task, plan.disturbances[0], plan.level, _first(plan.sweep_values), 0
+            )
             make_policy(policy, plan.scenario(cell), trust=plan.trust)
     for value in plan.sweep_values[-1:]:
         plan.scenario(

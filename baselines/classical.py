@@ -102,5 +102,3 @@ class FeedbackLinearisation(_Memoryless):
         forward = u_1 * cos - b * u_2 * sin + self.gain_per_s * (seen["e_1"] + b * (cos - 1.0))
         right = -u_1 * sin - b * u_2 * cos + self.gain_per_s * (seen["e_2"] - b * sin)
         return forward, -right / b
-
-

@@ -82,7 +82,9 @@ def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
     try:
         from stable_baselines3.common.save_util import load_from_zip_file
     except ModuleNotFoundError as error:
-        raise ValueError(f"{path} needs stable-baselines3 (pip install 'tlf-env[train]')") from error
+        raise ValueError(
+            f"{path} needs stable-baselines3 (pip install 'tlf-env[train]')"
+        ) from error
     import stable_baselines3
 
     data, _, _ = load_from_zip_file(path, device="cpu")
@@ -99,7 +101,11 @@ def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
 
 
 def _algorithm_of(data: dict[str, object], path: Path) -> str:
-    for key, algorithm in (("clip_range", "PPO"), ("ent_coef_optimizer", "SAC"), ("policy_delay", "TD3")):
+    for key, algorithm in (
+        ("clip_range", "PPO"),
+        ("ent_coef_optimizer", "SAC"),
+        ("policy_delay", "TD3"),
+    ):
         if key in data:
             return algorithm
     raise ValueError(f"{path}: neither a PPO, SAC nor TD3 model of stable-baselines3")

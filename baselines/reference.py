@@ -49,7 +49,8 @@ class ReferencePolicy:
     ) -> tuple[np.ndarray, Any]:
         """Action for one ``tracking`` observation ``(entry,)`` or a batch ``(batch, entry)``.
 
-        Returns the action, in the observation's dtype and within [−1, 1], and ``state`` unchanged: the law has no memory.
+        Returns the action, in the observation's dtype and within [−1, 1], and ``state`` unchanged:
+        the law has no memory.
 
         Raises
         ------

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 import json
 import platform
 from collections.abc import Callable, Mapping
@@ -15,8 +14,8 @@ import numpy as np
 
 from tlf_env.envs.parallel import checked_seed
 from tlf_env.numerics.files import atomic
-from tlf_env.physics.state import Motion
 from tlf_env.onboard.parts import Factory
+from tlf_env.physics.state import Motion
 from tlf_env.task.arrays import Arrays, Info
 from tlf_env.task.formation import Formation
 from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, string_metrics
@@ -125,7 +124,9 @@ class Record:
 
     def metrics(self) -> list[RobotMetrics]:
         """The summary of every robot."""
-        return robot_metrics(self.scenario, self.t_s, self.columns, self.lost_at_s, self.touched_at_s)
+        return robot_metrics(
+            self.scenario, self.t_s, self.columns, self.lost_at_s, self.touched_at_s
+        )
 
     def string(self) -> StringMetrics:
         """How errors grow along the string of robots."""
@@ -240,18 +241,30 @@ def summary(record: Record) -> dict[str, Any]:
     }
 
 
-def write_record(record: Record, folder: Path) -> None:
+def write_record(record: Record, folder: Path) -> list[Path]:
     """Write ``summary.json``, ``trajectory.npz`` and ``trajectory.csv``, each atomically."""
-    with atomic(folder / "summary.json", encoding="utf-8") as file:
+    paths = [folder / name for name in ("summary.json", "trajectory.npz", "trajectory.csv")]
+    with atomic(paths[0], encoding="utf-8") as file:
         json.dump(summary(record), file, indent=2, allow_nan=False)
         file.write("\n")
-    with atomic(folder / "trajectory.npz", "wb") as file:
+    with atomic(paths[1], "wb") as file:
         columns: dict[str, Any] = dict(record.columns)
         np.savez_compressed(file, t_s=record.t_s, leader_reference_mm=record.leader, **columns)
-    with atomic(folder / "trajectory.csv", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["t_s", "robot", *RECORDED])
-        table = np.stack([record[name] for name in RECORDED], axis=-1)
-        for t_s, rows in zip(record.t_s, table, strict=True):
-            for i, row in enumerate(rows):
-                writer.writerow([f"{t_s:.6g}", i, *(f"{value:.9g}" for value in row)])
+    table = np.stack([record[name] for name in RECORDED], axis=-1).reshape(-1, len(RECORDED))
+    times = np.repeat(record.t_s, record.robots)
+    numbers = np.tile(np.arange(record.robots), len(record.t_s))
+    with atomic(paths[2], encoding="utf-8") as file:
+        file.write(",".join(("t_s", "robot", *RECORDED)) + "\n")
+        rows = np.column_stack([times, numbers, table])
+        np.savetxt(file, rows, fmt=["%.6g", "%d", *["%.9g"] * len(RECORDED)], delimiter=",")
+    return paths
+
+
+def write_mat(record: Record, folder: Path) -> Path:
+    """Write ``trajectory.mat`` (MATLAB 5 format): the columns of the run, ``(time, robot)``."""
+    from scipy.io import savemat
+
+    path = folder / "trajectory.mat"
+    with atomic(path, "wb") as file:
+        savemat(file, {"t_s": record.t_s, "leader_reference_mm": record.leader, **record.columns})
+    return path

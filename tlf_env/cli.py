@@ -7,6 +7,7 @@ failed; 2 for bad input, told in one line.
 from __future__ import annotations
 
 import json
+import os
 import sys
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -48,13 +49,31 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
 
 @app.command()
 def run(
-    scenario: Annotated[str, typer.Argument(help="infinity, flower, or a scenario's YAML file.")],
-    disturbance: Annotated[str | None, typer.Option(help="Preset: nominal, none.")] = None,
+    scenario: Annotated[
+        str,
+        typer.Argument(
+            help="A preset (infinity, flower), a YAML file, or a path.csv: t_s,x_mm,y_mm."
+        ),
+    ],
+    disturbance: Annotated[
+        str | None,
+        typer.Option(help="Preset: nominal, none, noise, slip, ice, start, payload, ..."),
+    ] = None,
     level: Annotated[float | None, typer.Option(help="Level of the disturbance.")] = None,
-    policy: Annotated[str, typer.Option(help="Who drives: reference.")] = "reference",
+    policy: Annotated[
+        str,
+        typer.Option(
+            help="reference[:GAINS], pure_pursuit, feedback_linearisation, module:factory, FILE.zip."
+        ),
+    ] = "reference",
     gains: Annotated[
-        str, typer.Option(help="Gains of the reference: consistent, printed.")
-    ] = "consistent",
+        str | None, typer.Option(help="Gains of the reference: consistent (default), printed.")
+    ] = None,
+    estimator: Annotated[
+        str | None, typer.Option(help="ekf, truth (privileged), or module:factory.")
+    ] = None,
+    wheel_loop: Annotated[str | None, typer.Option(help="module:factory of a wheel loop.")] = None,
+    observer: Annotated[str | None, typer.Option(help="module:factory of an observer.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     robots: Annotated[int | None, typer.Option(help="How many robots.")] = None,
     plant: Annotated[str | None, typer.Option(help="pymunk or kinematic.")] = None,
@@ -64,13 +83,17 @@ def run(
         Path | None, typer.Option(help="Folder of the results; results/SCENARIO without it.")
     ] = None,
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    mat: Annotated[bool, typer.Option("--mat", help="Write trajectory.mat too.")] = False,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Load an SB3 .zip, which runs code that is in it.")
+    ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json instead of the table.")
     ] = False,
 ) -> None:
     """Drive a policy through a scenario to the horizon; a table, a summary, data and figures."""
     from baselines.policies import make_policy
-    from baselines.run import run_policy, summary, write_record
+    from baselines.run import run_policy, summary, write_mat, write_record
     from tlf_env.envs.parallel import checked_seed
     from tlf_env.task.scenario import load_scenario
 
@@ -80,22 +103,43 @@ def run(
         disturbance_level=level,
         robots=robots,
         plant=plant,
+        estimator=estimator,
+        wheel_loop=wheel_loop,
+        observer=observer,
         control_period_s=control_period_s,
         horizon_s=horizon_s,
     )
     checked_seed(seed)
-    driver = make_policy(policy, gains)
+    name = named_policy(policy, gains)
+    driver = make_policy(name, chosen, trust=trust)
     folder = writable_folder(out or Path("results") / chosen.name)
-    with progress_bar(f"{chosen.name}, {policy}") as update:
-        record = run_policy(chosen, driver, seed, name=f"{policy} ({gains})", progress=update)
-    write_record(record, folder)
-    drawn = draw(record, folder) if figures else []
+    with progress_bar(f"{chosen.name}, {name}") as update:
+        record = run_policy(chosen, driver, seed, name=name, progress=update)
+    written = write_record(record, folder)
+    if mat:
+        written.append(write_mat(record, folder))
+    if figures:
+        written += draw(record, folder)
     if as_json:
         typer.echo(json.dumps(summary(record), indent=2, allow_nan=False))
         return
     screen.print(metrics_table(record))
-    names = ["summary.json", "trajectory.npz", "trajectory.csv", *(path.name for path in drawn)]
-    screen.print(f"In {folder}: {', '.join(names)}", soft_wrap=True)
+    screen.print(f"In {folder}: {', '.join(path.name for path in written)}", soft_wrap=True)
+
+
+def named_policy(policy: str, gains: str | None) -> str:
+    """The policy's name with the reference's gains in it.
+
+    Raises
+    ------
+    ValueError
+        for gains that no policy takes.
+    """
+    if policy == "reference":
+        return f"reference:{gains or 'consistent'}"
+    if gains is not None:
+        raise ValueError(f"--gains {gains} goes with --policy reference, not with {policy!r}")
+    return policy
 
 
 def draw(record: Any, folder: Path) -> list[Path]:
@@ -113,20 +157,20 @@ def metrics_table(record: Any) -> Table:
     s = record.scenario
     table = Table(
         title=f"{s.name}, {record.policy}, disturbance {s.disturbance.name}, seed {record.seed}",
-        caption=f"RMS, largest error and time gap from {s.settle_s:g} s to {s.horizon_s:g} s; "
-        "the rest over the whole run",
+        caption=f"errors from {s.settle_s:g} s on (form from 5 s after its gap); "
+        "pos: to the own reference, form: to the leader's path one gap later each",
         box=SIMPLE_HEAD,
         collapse_padding=True,
         pad_edge=False,
     )
     columns: list[tuple[str, str, int]] = [
-        ("position\nRMS mm", "position_rmse_mm", 2),
-        ("largest\nmm", "position_max_mm", 1),
-        ("formation\nRMS mm", "formation_rmse_mm", 1),
-        ("heading\nRMS rad", "heading_rmse_rad", 4),
-        ("time gap\nRMS s", "time_gap_rmse_s", 4),
-        ("torque at\nlimit %", "saturation_fraction", 1),
-        ("largest\nslip mm/s", "slip_max_mm_s", 1),
+        ("pos RMS\nmm", "position_rmse_mm", 2),
+        ("max\nmm", "position_max_mm", 1),
+        ("form RMS\nmm", "formation_rmse_mm", 1),
+        ("head RMS\nrad", "heading_rmse_rad", 4),
+        ("gap RMS\ns", "time_gap_rmse_s", 4),
+        ("at limit\n%", "saturation_fraction", 1),
+        ("slip max\nmm/s", "slip_max_mm_s", 1),
     ]
     table.add_column("robot")
     for title, _, _ in columns:
@@ -183,6 +227,134 @@ def speed(
     with progress_bar("speed") as update:
         result = measure(steps, repeats, progress=update)
     typer.echo(json.dumps(result, indent=2))
+
+
+@app.command()
+def bench(
+    policies: Annotated[
+        str, typer.Option(help="Names as in `tlf run --policy`, parted by commas.")
+    ] = "reference:consistent,reference:printed,pure_pursuit,feedback_linearisation",
+    tasks: Annotated[str, typer.Option(help="Scenarios, parted by commas.")] = "infinity,flower",
+    disturbances: Annotated[
+        str, typer.Option(help="Disturbance presets, parted by commas, or all.")
+    ] = "all",
+    seeds: Annotated[str, typer.Option(help="FIRST:END; END is not run.")] = "20000:20050",
+    level: Annotated[float, typer.Option(help="Level of the disturbances.")] = 1.0,
+    sweep: Annotated[
+        str | None,
+        typer.Option(
+            help="A knob's values instead: PATH=FIRST:LAST:COUNT, slip.delta_1_mm_s=0:40:9."
+        ),
+    ] = None,
+    horizon_s: Annotated[float | None, typer.Option(help="Length of each run, s.")] = None,
+    processes: Annotated[int, typer.Option(help="Processes on this machine; 0: one per core.")] = 0,
+    ray: Annotated[
+        str | None, typer.Option(help="Address of an existing Ray cluster to run on instead.")
+    ] = None,
+    trust: Annotated[
+        bool, typer.Option("--trust", help="Load SB3 .zip files, which runs code in them.")
+    ] = False,
+    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("results/bench"),
+    figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print leaderboard.json instead of the tables.")
+    ] = False,
+) -> None:
+    """Compare policies on the same draws; interrupt it and call it again to go on."""
+    from baselines.bench import Plan, disturbance_presets, parse_seeds, parse_sweep, run_bench
+
+    path, values = parse_sweep(sweep) if sweep else (None, ())
+    plan = Plan(
+        policies=listed(policies),
+        tasks=listed(tasks),
+        disturbances=tuple(disturbance_presets())
+        if disturbances == "all"
+        else listed(disturbances),
+        seeds=parse_seeds(seeds),
+        level=level,
+        sweep=path,
+        sweep_values=values,
+        overrides=() if horizon_s is None else (("horizon_s", horizon_s),),
+        trust=trust,
+    )
+    folder = writable_folder(out)
+    with progress_bar("bench") as update:
+        results = run_bench(
+            plan,
+            folder,
+            processes=processes or os.cpu_count() or 1,
+            ray_address=ray,
+            progress=update,
+        )
+    from baselines.aggregate import write_leaderboard
+
+    board = write_leaderboard(results, folder, "tlf " + " ".join(without_places(sys.argv[1:])))
+    if figures:
+        draw_bench(board, folder)
+    if as_json:
+        typer.echo(json.dumps(board, indent=1, allow_nan=False))
+    else:
+        screen.print(board_table(board))
+        screen.print(f"In {folder}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
+
+
+PLACES = ("--out", "--processes", "--ray")
+
+
+def without_places(words: list[str]) -> list[str]:
+    """A command's words without those that say where it runs: they do not change a result."""
+    kept: list[str] = []
+    skip = False
+    for word in words:
+        if skip or word.split("=")[0] in PLACES:
+            skip = not skip and "=" not in word
+            continue
+        kept.append(word)
+    return kept
+
+
+def listed(text: str) -> tuple[str, ...]:
+    """Names parted by commas.
+
+    Raises
+    ------
+    ValueError
+        if there is none, or one twice.
+    """
+    names = tuple(name.strip() for name in text.split(",") if name.strip())
+    if not names or len(set(names)) < len(names):
+        raise ValueError(f"{text!r} must be names parted by commas, each once")
+    return names
+
+
+def draw_bench(board: dict[str, Any], folder: Path) -> None:
+    """The benchmark's figures, or a hint where matplotlib is missing."""
+    try:
+        from baselines.bench_figures import write_bench_figures
+    except ModuleNotFoundError as error:
+        notes.print(f"No figures: {error.name} is missing (pip install 'tlf-env[figures]').")
+        return
+    write_bench_figures(board, folder)
+
+
+def board_table(board: dict[str, Any]) -> Table:
+    """Policies over all tasks and disturbances."""
+    table = Table(title="score 0 to 100, interquartile mean over all runs", box=SIMPLE_HEAD)
+    table.add_column("policy")
+    for title in ("score", "95 %", "normalised", "better than\nreference", "failed"):
+        table.add_column(title, justify="right")
+    for row in board["policies"]:
+        ends, better = row["score"]["interval"], row["probability_of_improvement"]
+        scaled = row["normalised_score"]
+        table.add_row(
+            row["policy"] + (" (privileged)" if row["privileged"] else ""),
+            f"{row['score']['iqm']:.1f}",
+            "–" if ends is None else f"{ends[0]:.1f}–{ends[1]:.1f}",
+            "–" if scaled is None else f"{scaled:.2f}",
+            "–" if better is None else f"{better:.2f}",
+            f"{row['failed']} of {row['runs']}",
+        )
+    return table
 
 
 def writable_folder(folder: Path) -> Path:

@@ -47,7 +47,7 @@ write_loop_state = writer(WheelLoopState)
 
 
 def digital_wheel_loop(p: WheelLoopParameters, dt_s: float) -> WheelLoop:
-    """Zero-order-hold form of eq. (13) at a period of ``dt_s`` s."""
+    """Eq. (13) at a period of ``dt_s`` s: exact decay of the lag, and the current error already in."""
     integral = p.gain_Nmm_s * p.zeros_0 / p.pole_rad_s
     lag = -p.gain_Nmm_s * (p.pole_rad_s**2 - p.zeros_1 * p.pole_rad_s + p.zeros_0) / p.pole_rad_s
     decay = math.exp(-p.pole_rad_s * dt_s)

@@ -192,7 +192,7 @@ def actuate_robot(
         )
         return moved, contact, held, trace
     limit = body.torque_limit
-    if kind == TORQUE or kind == EXTERNAL_TORQUE:
+    if kind in (TORQUE, EXTERNAL_TORQUE):
         torque_l = min(max(wanted_l, -limit), limit)
         torque_r = min(max(wanted_r, -limit), limit)
     else:
@@ -306,8 +306,8 @@ def sense_robot(
 @law
 def delays(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
     """Dead time of the torques, and for how long the last action still holds, in ticks."""
-    dead = int(round(a.applied[DEAD_TIME, r, lane] / dt))
-    return dead, int(round(a.applied[COMPUTING_DELAY, r, lane] / dt))
+    dead = round(a.applied[DEAD_TIME, r, lane] / dt)
+    return dead, round(a.applied[COMPUTING_DELAY, r, lane] / dt)
 
 
 @block

@@ -145,7 +145,9 @@ class StringMetrics(NamedTuple):
     A gain up to 1 means that no follower makes more of its predecessor's error.
     """
 
-    time_gain: float | None  # largest ratio of the followers' RMS formation error to the predecessor's
+    time_gain: (
+        float | None
+    )  # largest ratio of the followers' RMS formation error to the predecessor's
     frequency_gain: float | None  # largest gain of the error's spectrum between neighbours
     frequency_Hz: float | None  # where that is
 
@@ -169,9 +171,7 @@ def string_metrics(
 
     first = round(scenario.settle_s / scenario.control_period_s)
     steps, robots = columns["x_mm"].shape
-    across = [
-        deviation_mm(columns, leader, i, i * scenario.gap_steps) for i in range(robots)
-    ]
+    across = [deviation_mm(columns, leader, i, i * scenario.gap_steps) for i in range(robots)]
     gains: list[float] = []
     peaks: list[tuple[float, float]] = []
     for i in range(1, robots):
