@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -23,6 +23,7 @@ Colour = tuple[int, int, int]
 
 RENDER_MODES: tuple[Mode, ...] = ("rgb_array", "human")
 OVERSAMPLING = 2
+SOFT_PX = 0.7  # of the canvas: how far a soft edge reaches
 DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and grow with it
 SMALLEST_PX = 64
 
@@ -62,20 +63,20 @@ VIRIDIS = np.array(
 LIGHTEST = 0.92  # of the map; its end is lost on white
 
 DRIVE_WHEEL_WIDTH_MM, CASTOR_WIDTH_MM, AXLE_MM = 22.0, 14.0, 8.0  # for the picture only
-TREADS = 4  # few: more would seem to turn backwards at top speed and 20 frames/s
+TREADS, TREAD_RADII = 4, 0.2  # few: more would seem to turn backwards at top speed and 20 frames/s
 SLIP_SHOWN_MM_S, SLIP_FULL_MM_S = (
     2.0,
     60.0,
 )  # where a wheel's mark begins, and where it is strongest
 
-ARM_RADII = 0.35  # arms of the reference's cross
+ARM_RADII = 0.25  # arms of the reference's cross
 MARGIN_RADII = 3.0  # room around the path, in outline radii
 MOST_START_MM = 1500.0  # how far the view grows towards robots that start off the path
 STILL_MM = 1e-3  # who went less has no direction
-TRAIL_POINTS = 120
-PATH_POINTS = 1500
+TRAIL_POINTS, BLOCK = 100, 5  # of one trail; pieces of one colour in it
+PATH_POINTS = 1000
 TRAIL_PX, PATH_PX = 5.0, 2.0
-CLOSE_UP_PX, CLOSE_UP_RADII = 208, 4.0  # side of the close-up; how much floor, in outline radii
+CLOSE_UP_PX, CLOSE_UP_RADII = 184, 3.2  # side of the close-up; how much floor, in outline radii
 CLOSE_UP_PEN = 1.3  # its lines against the others
 EDGE_PX, LINE_PX = 14, 18
 TEXT_PX, TIME_PX = 19, 27  # of pygame's own font, whose letters are two thirds of that
@@ -83,7 +84,7 @@ GRID_PX = 90  # least side of a grid square
 COLUMNS_PX = (18, 140, 208, 218)  # name, error, time gap, flags
 
 CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 49)) for f in (np.cos, np.sin)], axis=-1)
-NOSE = np.array([[-0.26, 0.44], [0.26, 0.44], [0.0, 0.92]])  # of what the outline is ahead of c
+NOSE = ((-0.26, 0.44), (0.26, 0.44), (0.0, 0.92))  # of what the outline is ahead of c
 
 
 class Scene(NamedTuple):
@@ -117,31 +118,34 @@ class Scene(NamedTuple):
 def scene_of(formation: Formation) -> Scene:
     """The scene of a formation as it is now: the truth, in fresh arrays."""
     a = formation.arrays
-    motion = Motion(*a.motions[:, :, 0].copy())
-    contact = Contact(*a.contacts[:, :, 0].copy())
-    state = State(*formation.state().T)
+    motion = dict(zip(Motion._fields, a.motions[:, :, 0].copy(), strict=True))
+    contact = dict(zip(Contact._fields, a.contacts[:, :, 0].copy(), strict=True))
+    state = dict(zip(State._fields, formation.state().T, strict=True))
     slot = formation.step_count % a.references.shape[1]
-    reference = Reference(*a.references[:, slot, :, 0].copy())
-    info = Info(*a.infos[0].T.copy())
+    reference = dict(zip(Reference._fields, a.references[:, slot, :, 0].copy(), strict=True))
+    info = dict(zip(Info._fields, a.infos[0].T.copy(), strict=True))
+    ghost_x_mm, ghost_y_mm, ghost_theta_rad = _ghosts(formation, motion["theta"])
     return Scene(
-        formation.time_s,
-        state.x_mm,
-        state.y_mm,
-        motion.theta,
-        state.castor_rad,
-        motion.angle_l,
-        motion.angle_r,
-        reference.x,
-        reference.y,
-        reference.theta,
-        *_ghosts(formation, motion.theta),
-        contact.slip_l,
-        contact.slip_r,
-        contact.slip_c,
-        info.position_error_mm,
-        info.time_gap_error_s,
-        a.lost[0].copy(),
-        a.touched[0].copy(),
+        t_s=formation.time_s,
+        x_mm=state["x_mm"],
+        y_mm=state["y_mm"],
+        theta_rad=motion["theta"],
+        castor_rad=state["castor_rad"],
+        wheel_angle_l_rad=motion["angle_l"],
+        wheel_angle_r_rad=motion["angle_r"],
+        reference_x_mm=reference["x"],
+        reference_y_mm=reference["y"],
+        reference_theta_rad=reference["theta"],
+        ghost_x_mm=ghost_x_mm,
+        ghost_y_mm=ghost_y_mm,
+        ghost_theta_rad=ghost_theta_rad,
+        slip_l_mm_s=contact["slip_l"],
+        slip_r_mm_s=contact["slip_r"],
+        slip_c_mm_s=contact["slip_c"],
+        position_error_mm=info["position_error_mm"],
+        time_gap_error_s=info["time_gap_error_s"],
+        lost=a.lost[0].copy(),
+        touched=a.touched[0].copy(),
     )
 
 
@@ -188,9 +192,11 @@ class View(NamedTuple):
         offset = (self.left + 0.5, self.top + 0.5)
         return (points_mm - self.corner_mm) * (self.scale, -self.scale) + offset
 
-    def mm(self, design_px: float) -> float:
-        """Length on the floor of a length in the design."""
-        return design_px * self.pen / self.scale
+    def place(self, x_mm: float, y_mm: float, theta_rad: float) -> Place:
+        """A pose on the canvas."""
+        x = self.left + (x_mm - self.corner_mm[0]) * self.scale
+        y = self.top + (self.corner_mm[1] - y_mm) * self.scale
+        return Place(x, y, theta_rad, self.scale)
 
     def shows(self, px: np.ndarray, room: float = 0.0) -> np.ndarray:
         """Which canvas points lie in the window or less than ``room`` beside it; NaN never does."""
@@ -203,22 +209,24 @@ class View(NamedTuple):
         return self.left, self.top, self.width, self.height
 
 
-class Frame(NamedTuple):
-    """A pose as a map: from its own axes (e right, f forward) to the floor, mm."""
+class Place(NamedTuple):
+    """A pose on the canvas and the scale there; its own axes are e (right) and f (forward), in mm."""
 
-    x: float
-    y: float
-    theta: float
+    x: float  # canvas px, to the right
+    y: float  # canvas px, down
+    theta: float  # from up, counter-clockwise
+    scale: float  # px per mm
 
-    def __call__(self, points: np.ndarray) -> np.ndarray:
-        """Points ``(k, 2)`` on the floor."""
-        sin, cos = math.sin(self.theta), math.cos(self.theta)
-        return points @ np.array([[cos, sin], [-sin, cos]]) + (self.x, self.y)
+    def px(self, points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+        """Canvas coordinates of points (e, f)."""
+        sin, cos = self.scale * math.sin(self.theta), self.scale * math.cos(self.theta)
+        x, y = self.x, self.y
+        return [(x + e * cos - f * sin, y - e * sin - f * cos) for e, f in points]
 
-    def at(self, e: float, f: float, turn: float = 0.0) -> Frame:
-        """A frame that lies in this one."""
-        x, y = self(np.array([e, f]))
-        return Frame(x, y, self.theta + turn)
+    def at(self, e: float, f: float, turn: float = 0.0) -> Place:
+        """A pose relative to this one."""
+        ((x, y),) = self.px([(e, f)])
+        return Place(x, y, self.theta + turn, self.scale)
 
 
 class Renderer:
@@ -258,7 +266,7 @@ class Renderer:
         robots: Sequence[RobotParameters],
         path_mm: np.ndarray,
         *,
-        mode: Mode,
+        mode: str,
         fps: float,
         size_px: tuple[int, int] = DESIGN_SIZE_PX,
         trail_s: float = 20.0,
@@ -272,12 +280,17 @@ class Renderer:
         self._pg = _pygame()
         self._robots = list(robots)
         self._colours = robot_colours(len(robots))
+        self._faded = [
+            [mixed(FLOOR, colour, part) for colour in self._colours]
+            for part in np.linspace(0.15, 0.85, 32).tolist()
+        ]
         stride = max(1, len(path_mm) // PATH_POINTS)
         self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
         self._patches = list(patches)
         self._fps, self._trail_s = fps, trail_s
         self._focus = None if close_up is None else min(close_up, len(robots) - 1)
         self._trail: list[tuple[float, np.ndarray]] = []  # time, (robot, 2)
+        self._background: Any = None
         self._open, self._window = True, mode == "human"
         if self._window:
             self._open_window(size_px)
@@ -326,7 +339,7 @@ class Renderer:
             pg.font.Font(None, max(10, round(size * self._unit)))
             for size in (TEXT_PX, TIME_PX, TEXT_PX * OVERSAMPLING)
         )
-        self._background: Any = None
+        self._background = None
 
     def _pixels(self) -> np.ndarray:
         width, height = self._size_px
@@ -387,7 +400,7 @@ class Renderer:
 
     def _draw_background(self) -> Any:
         self._view = self._fit()
-        step_mm = round_length(self._view.mm(GRID_PX))
+        step_mm = round_length(GRID_PX * self._view.pen / self._view.scale)
         self._draw_floor(self._view, step_mm)
         self._draw_scale_bar(self._view, step_mm)
         if self._focus is not None:
@@ -404,15 +417,15 @@ class Renderer:
                 self._canvas.fill(colour, (x, view.top, OVERSAMPLING, view.height))
             for y in rows:
                 self._canvas.fill(colour, (view.left, y, view.width, OVERSAMPLING))
-        width_mm = np.full(len(self._path_mm), view.mm(PATH_PX))
-        self._draw_lines(view, self._path_mm[:, None], width_mm, lambda j, i: PATH)
+        width = np.full(len(self._path_mm), PATH_PX * view.pen)
+        self._draw_lines(view, self._path_mm[:, None], width, [[PATH]] * len(width))
 
     def _draw_patch(self, view: View, patch: Mapping[str, float]) -> None:
-        centre = np.array([patch["x_mm"], patch["y_mm"]])
+        centre = view.place(patch["x_mm"], patch["y_mm"], 0.0)
         colour = SLIPPERY if patch["scale"] < 1 else GRIPPY
-        self._fill(view, centre + patch["radius_mm"] * CIRCLE, colour)
+        self._disc(centre, patch["radius_mm"] * view.scale, colour)
         if view is self._view:
-            self._label(f"µ × {patch['scale']:g}", center=view.px(centre).tolist())
+            self._label(f"µ × {patch['scale']:g}", center=(centre.x, centre.y))
 
     def _draw_scale_bar(self, view: View, length_mm: float) -> None:
         pen, length = self._view.pen, length_mm * view.scale
@@ -434,16 +447,19 @@ class Renderer:
     def _draw_robots(self, view: View, scene: Scene) -> None:
         self._draw_trails(view)
         room = 2 * view.scale * max(robot.outline_radius_mm for robot in self._robots)
-        places = np.stack([scene.x_mm, scene.y_mm], axis=-1)
-        ghosts = np.stack([scene.ghost_x_mm, scene.ghost_y_mm], axis=-1)
-        references = np.stack([scene.reference_x_mm, scene.reference_y_mm], axis=-1)
-        for draw, points in (
-            (self._draw_robot, places),
-            (self._draw_ghost, ghosts),
-            (self._draw_reference, references),
+        for draw, x_mm, y_mm, theta_rad in (
+            (self._draw_robot, scene.x_mm, scene.y_mm, scene.theta_rad),
+            (self._draw_ghost, scene.ghost_x_mm, scene.ghost_y_mm, scene.ghost_theta_rad),
+            (
+                self._draw_reference,
+                scene.reference_x_mm,
+                scene.reference_y_mm,
+                scene.reference_theta_rad,
+            ),
         ):
-            for i in np.flatnonzero(view.shows(view.px(points), room)).tolist():
-                draw(view, scene, i)
+            shown = view.shows(view.px(np.stack([x_mm, y_mm], axis=-1)), room)
+            for i in np.flatnonzero(shown).tolist():
+                draw(view, view.place(x_mm[i], y_mm[i], theta_rad[i]), scene, i)
 
     def _draw_trails(self, view: View) -> None:
         """Thinner and paler the older; the youngest of all robots on top."""
@@ -452,85 +468,81 @@ class Renderer:
         points = np.stack([places for _, places in self._trail])
         age_s = self._trail[-1][0] - np.array([t_s for t_s, _ in self._trail])
         youth = 1 - age_s / self._trail_s
-        colours = [
-            [mixed(FLOOR, colour, 0.15 + 0.7 * part) for colour in self._colours]
-            for part in youth[1:].tolist()
-        ]
-        self._draw_lines(view, points, view.mm(TRAIL_PX) * youth, lambda j, i: colours[j][i])
+        shades = (youth[::BLOCK] * (len(self._faded) - 1)).astype(int).tolist()
+        colours = [self._faded[shade] for shade in shades]
+        self._draw_lines(view, points, TRAIL_PX * view.pen * youth, colours)
 
-    def _draw_robot(self, view: View, scene: Scene, i: int) -> None:
-        robot, colour = self._robots[i], self._colours[i]
-        body = Frame(scene.x_mm[i], scene.y_mm[i], scene.theta_rad[i])
-        centre, line = body.at(0, -robot.outline_offset_mm), view.mm(1.4)
-        radius, half = robot.outline_radius_mm, robot.axle_width_mm / 2
-        self._fill(view, centre((radius + line / 2) * CIRCLE), mixed(FLOOR, colour, 0.85))
-        self._fill(view, centre((radius - line / 2) * CIRCLE), mixed(FLOOR, colour, 0.25))
-        self._fill(view, body(_rectangle(2 * half, AXLE_MM)), mixed(FLOOR, colour, 0.6))
-        self._fill(view, body((radius - robot.outline_offset_mm) * NOSE), colour)
+    def _draw_robot(self, view: View, body: Place, scene: Scene, i: int) -> None:
+        robot, colour, pen = self._robots[i], self._colours[i], view.pen
+        centre, half = body.at(0, -robot.outline_offset_mm), robot.axle_width_mm / 2
+        radius = view.scale * robot.outline_radius_mm
+        self._disc(centre, radius + 0.6 * pen, mixed(FLOOR, colour, 0.6))
+        self._disc(centre, radius - 0.6 * pen, mixed(FLOOR, colour, 0.25))
+        self._bar(body, (2 * half * view.scale, AXLE_MM * view.scale), mixed(FLOOR, colour, 0.6))
+        ahead = robot.outline_radius_mm - robot.outline_offset_mm
+        self._fill(body.px((ahead * e, ahead * f) for e, f in NOSE), colour)
         fork = body.at(0, -robot.castor_pivot_mm, scene.castor_rad[i])
         castor = fork.at(0, -robot.castor_trail_mm)
-        castor_mm = CASTOR_WIDTH_MM, 2 * robot.castor_radius_mm
-        self._draw_tyre(view, castor, castor_mm, scene.slip_c_mm_s[i])
-        wheel_mm = DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm
+        self._draw_tyre(view, castor, CASTOR_WIDTH_MM, robot.castor_radius_mm, scene.slip_c_mm_s[i])
         for e, angle, slip in (
             (-half, scene.wheel_angle_l_rad[i], scene.slip_l_mm_s[i]),
             (half, scene.wheel_angle_r_rad[i], scene.slip_r_mm_s[i]),
         ):
-            self._draw_tyre(view, body.at(e, 0), wheel_mm, slip)
-            for tread in _treads(robot.wheel_radius_mm, angle):
-                self._fill(view, body.at(e, 0)(tread), TREAD)
+            wheel = body.at(e, 0)
+            self._draw_tyre(view, wheel, DRIVE_WHEEL_WIDTH_MM, robot.wheel_radius_mm, slip)
+            self._draw_treads(wheel, robot.wheel_radius_mm, angle)
         if scene.touched[i]:
-            self._fill(view, centre(_ring(radius, view.mm(3.5))), ALARM)
+            self._ring(centre, radius, 2.5 * pen, ALARM)
         if scene.lost[i]:
-            for bar in _cross(0.9 * radius, view.mm(3.5)):
-                self._fill(view, centre.at(0, 0, math.pi / 4)(bar), ALARM)
+            self._cross(centre.at(0, 0, math.pi / 4), 0.9 * radius, 2.5 * pen, ALARM)
 
     def _draw_tyre(
-        self, view: View, wheel: Frame, size_mm: tuple[float, float], slip_mm_s: float
+        self, view: View, wheel: Place, width_mm: float, radius_mm: float, slip_mm_s: float
     ) -> None:
         """A wheel from above; one that slips glows."""
+        width, length = width_mm * view.scale, 2 * radius_mm * view.scale
         strength = 0.0
         if slip_mm_s > SLIP_SHOWN_MM_S:
             strength = min(0.45 + 0.55 * slip_mm_s / SLIP_FULL_MM_S, 1.0)
-            glow = 2 * view.mm(2.0)
-            halo = _rectangle(size_mm[0] + glow, size_mm[1] + glow)
-            self._fill(view, wheel(halo), mixed(FLOOR, ALARM, 0.5 * strength))
-        self._fill(view, wheel(_rectangle(*size_mm)), mixed(TYRE, ALARM, strength))
+            glow = 4.0 * view.pen
+            self._bar(wheel, (width + glow, length + glow), mixed(FLOOR, ALARM, 0.5 * strength))
+        self._bar(wheel, (width, length), mixed(TYRE, ALARM, strength))
 
-    def _draw_ghost(self, view: View, scene: Scene, i: int) -> None:
-        """The predecessor's outline one gap ago and a line to its front, in the follower's colour."""
-        robot, line = self._robots[i - 1], view.mm(1.3)
-        body = Frame(scene.ghost_x_mm[i], scene.ghost_y_mm[i], scene.ghost_theta_rad[i])
+    def _draw_treads(self, wheel: Place, radius_mm: float, angle: float) -> None:
+        """The marks on the upper side of a wheel, foreshortened; rolling moves them forwards."""
+        for k in range(TREADS):
+            turn = angle + 2 * math.pi * k / TREADS
+            if math.cos(turn) > 0.3:
+                thickness = TREAD_RADII * radius_mm * math.cos(turn) * wheel.scale
+                size = DRIVE_WHEEL_WIDTH_MM * wheel.scale, thickness
+                self._bar(wheel.at(0, radius_mm * math.sin(turn)), size, TREAD)
+
+    def _draw_ghost(self, view: View, body: Place, scene: Scene, i: int) -> None:
+        """The predecessor's outline one gap ago and a tick at its front, in the follower's colour."""
+        robot, line = self._robots[i - 1], 1.3 * view.pen
         radius, offset = robot.outline_radius_mm, robot.outline_offset_mm
-        colour = mixed(INK, self._colours[i], 0.6)
-        self._fill(view, body.at(0, -offset)(_ring(radius, line)), colour)
-        front = body.at(0, 0.75 * radius - offset)
-        self._fill(view, front(_rectangle(line, radius / 2)), colour)
+        self._ring(body.at(0, -offset), radius * view.scale, line, self._colours[i])
+        front = body.at(0, 1.1 * radius - offset)
+        self._bar(front, (line, 0.2 * radius * view.scale), self._colours[i])
 
-    def _draw_reference(self, view: View, scene: Scene, i: int) -> None:
+    def _draw_reference(self, view: View, place: Place, scene: Scene, i: int) -> None:
         """A cross, its arms along the reference's axes."""
-        frame = Frame(
-            scene.reference_x_mm[i], scene.reference_y_mm[i], scene.reference_theta_rad[i]
-        )
-        arm = ARM_RADII * self._robots[i].outline_radius_mm
-        for line, colour in ((view.mm(3.0), FLOOR), (view.mm(1.2), INK)):
-            for bar in _cross(arm + line / 2, line):
-                self._fill(view, frame(bar), colour)
+        arm = ARM_RADII * self._robots[i].outline_radius_mm * view.scale
+        self._cross(place, arm, 1.2 * view.pen, INK)
 
     def _draw_arrows(self, scene: Scene) -> None:
         """An arrow and a name at the edge for every robot that is outside."""
         view, pen = self._view, self._view.pen
         places = view.px(np.stack([scene.x_mm, scene.y_mm], axis=-1))
-        middle = np.array([view.width / 2, view.height / 2])
+        size = np.array([view.width, view.height])
         for i in np.flatnonzero(np.isfinite(places).all(axis=-1) & ~view.shows(places)).tolist():
-            e, f = places[i] - middle
-            tip = np.clip(places[i], 5 * pen, 2 * middle - 5 * pen)
-            arrow = Frame(tip[0], tip[1], math.atan2(-e, f))
-            shape = np.array([[0.0, 0.0], [-7.0, -16.0], [7.0, -16.0]]) * pen
-            self._pg.draw.polygon(self._canvas, self._colours[i], arrow(shape).tolist())
-            room = np.clip(tip, 60 * pen, 2 * middle - 60 * pen)
-            name = arrow.at(0, -26 * pen)
-            self._label(f"robot_{i}", center=(float(room[0]), name.y))
+            right, down = places[i] - size / 2
+            x, y = np.clip(places[i], 5 * pen, size - 5 * pen).tolist()
+            arrow = Place(x, y, math.atan2(-right, -down), pen)
+            self._fill(arrow.px([(0, 0), (-7, -16), (7, -16)]), self._colours[i])
+            name = arrow.at(0, -28)
+            middle = min(max(name.x, 36 * pen), view.width - 36 * pen)
+            self._label(f"robot_{i}", center=(middle, name.y))
 
     # Close-up
 
@@ -539,11 +551,13 @@ class Renderer:
         side = OVERSAMPLING * round(CLOSE_UP_PX * u)
         left = OVERSAMPLING * round(EDGE_PX * u)
         top = self._view.height - side - OVERSAMPLING * round((EDGE_PX + 3 * LINE_PX) * u)
-        extent = CLOSE_UP_RADII * robot.outline_radius_mm
-        body = Frame(scene.x_mm[i], scene.y_mm[i], scene.theta_rad[i])
-        centre = body.at(0, -robot.outline_offset_mm)
-        corner = (centre.x - extent / 2, centre.y + extent / 2)
-        return View(left, top, side, side, corner, side / extent, CLOSE_UP_PEN * self._view.pen)
+        extent_mm = CLOSE_UP_RADII * robot.outline_radius_mm
+        back_mm = robot.outline_offset_mm
+        middle_x = float(scene.x_mm[i] + back_mm * np.sin(scene.theta_rad[i]))
+        middle_y = float(scene.y_mm[i] - back_mm * np.cos(scene.theta_rad[i]))
+        corner_mm = (middle_x - extent_mm / 2, middle_y + extent_mm / 2)
+        pen = CLOSE_UP_PEN * self._view.pen
+        return View(left, top, side, side, corner_mm, side / extent_mm, pen)
 
     def _draw_close_up(self, i: int, scene: Scene) -> None:
         view = self._close_up_view(i, scene)
@@ -562,19 +576,17 @@ class Renderer:
         """What the marks mean, under the close-up."""
         pen = self._view.pen
         x, y = (EDGE_PX + 8) * pen, self._view.height - (EDGE_PX + 2.3 * LINE_PX) * pen
-        flat = View(0, 0, 1, 1, (0.0, 0.0), 1.0, pen)
-        rows = ["its reference", "a slipping wheel", "its predecessor one gap ago"]
-        for row, text in enumerate(rows[: 2 if len(self._robots) == 1 else 3]):
-            mark = Frame(x, -(y + row * LINE_PX * pen), 0.0)
-            if row == 0:
-                for bar in _cross(6 * pen, 1.3 * pen):
-                    self._fill(flat, mark(bar), INK)
-            elif row == 1:
-                self._fill(flat, mark(_rectangle(8 * pen, 13 * pen)), mixed(FLOOR, ALARM, 0.5))
-                self._fill(flat, mark(_rectangle(4 * pen, 9 * pen)), ALARM)
-            else:
-                self._fill(flat, mark(_ring(6 * pen, 1.5 * pen)), mixed(INK, self._colours[1], 0.6))
-            self._label(text, midleft=(x + 12 * pen, -mark.y))
+        mark, below = Place(x, y, 0.0, 1.0), -LINE_PX * pen
+        self._cross(mark, 6 * pen, 1.3 * pen, INK)
+        self._label("reference", midleft=(x + 12 * pen, y))
+        mark = mark.at(0, below)
+        self._bar(mark, (9 * pen, 14 * pen), mixed(FLOOR, ALARM, 0.5))
+        self._bar(mark, (5 * pen, 10 * pen), ALARM)
+        self._label("slipping wheel", midleft=(x + 12 * pen, mark.y))
+        if len(self._robots) > 1:
+            mark = mark.at(0, below)
+            self._ring(mark, 6 * pen, 1.5 * pen, self._colours[self._focus or 1])
+            self._label("predecessor one gap ago", midleft=(x + 12 * pen, mark.y))
 
     # Text
 
@@ -598,33 +610,70 @@ class Renderer:
         texts = (f"robot_{i}", _length_text(scene.position_error_mm[i]), gap, ", ".join(flags))
         sides = ("topleft", "topright", "topright", "topleft")
         for text, column, side in zip(texts, COLUMNS_PX, sides, strict=True):
+            if not text:
+                continue
             image = self._font.render(text, True, ALARM if column == COLUMNS_PX[-1] else INK)
             self._picture.blit(image, image.get_rect(**{side: (x + column * u, y)}))
 
-    # Shapes
+    # Shapes, lengths in canvas px
 
-    def _fill(self, view: View, points_mm: np.ndarray, colour: Colour) -> None:
-        self._pg.draw.polygon(self._canvas, colour, view.px(points_mm).tolist())
+    def _fill(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
+        """A polygon; pygame cuts fractions off."""
+        polygon = [(x + 0.5, y + 0.5) for x, y in points]
+        self._pg.draw.polygon(self._canvas, colour, polygon)
+
+    def _smooth(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
+        """A polygon with a soft edge around it, about 0.7 px wide."""
+        self._fill(points, colour)
+        self._pg.draw.aalines(self._canvas, colour, True, points)
+
+    def _bar(self, place: Place, size: tuple[float, float], colour: Colour) -> None:
+        """A rectangle around a place: its sides along e and f."""
+        e, f = (max(side / 2 - SOFT_PX, 0.3) / place.scale for side in size)
+        self._smooth(place.px([(-e, -f), (e, -f), (e, f), (-e, f)]), colour)
+
+    def _cross(self, place: Place, arm: float, width: float, colour: Colour) -> None:
+        self._bar(place, (2 * arm, width), colour)
+        self._bar(place, (width, 2 * arm), colour)
+
+    def _disc(self, place: Place, radius: float, colour: Colour) -> None:
+        points = (radius - SOFT_PX) * CIRCLE + (place.x, place.y)
+        self._smooth(points.tolist(), colour)
+
+    def _ring(self, place: Place, radius: float, width: float, colour: Colour) -> None:
+        """A circle's line as one polygon: round outside, and back inside."""
+        half, middle = max(width / 2 - SOFT_PX, 0.3), (place.x, place.y)
+        outside = ((radius + half) * CIRCLE + middle).tolist()
+        inside = ((radius - half) * CIRCLE[::-1] + middle).tolist()
+        self._smooth(outside + inside, colour)
 
     def _draw_lines(
         self,
         view: View,
         points_mm: np.ndarray,
-        width_mm: np.ndarray,
-        colour: Callable[[int, int], Colour],
+        width: np.ndarray,
+        colours: Sequence[Sequence[Colour]],
     ) -> None:
-        """Lines through ``(point, line, 2)``, first pieces first; ``colour`` of a piece and a line."""
-        along = np.gradient(points_mm, axis=0)
+        """Lines through ``(point, line, 2)``, ``width`` wide at each point, first blocks first.
+
+        A block is ``BLOCK`` pieces long; ``colours`` holds one for each block and line.
+        """
+        points = view.px(points_mm)
+        along = np.gradient(points, axis=0)
         length = np.linalg.norm(along, axis=-1, keepdims=True)
         along = np.divide(along, length, out=np.zeros_like(along), where=length > 0)
-        side = along[..., ::-1] * (-0.5, 0.5) * width_mm[:, None, None]
-        left, right = view.px(points_mm + side), view.px(points_mm - side)
-        shown = view.shows(left, view.width)
-        pieces = np.nonzero(shown[:-1] & shown[1:])
-        quads = np.stack([left[:-1], left[1:], right[1:], right[:-1]], axis=2)[pieces]
-        polygon, canvas = self._pg.draw.polygon, self._canvas
-        for j, i, quad in zip(*(k.tolist() for k in pieces), quads.tolist(), strict=True):
-            polygon(canvas, colour(j, i), quad)
+        side = along[..., ::-1] * (-0.5, 0.5) * width[:, None, None]
+        left, right = points + side, points - side
+        starts = np.arange(0, len(points) - 1, BLOCK)
+        near = np.logical_or.reduceat(view.shows(points, view.width / 2), starts)
+        possible = np.logical_and.reduceat(view.shows(points, 8 * view.width), starts)
+        for block, i in np.argwhere(near & possible).tolist():
+            here = slice(starts[block], starts[block] + BLOCK + 1)
+            outline = np.concatenate([left[here, i], right[here, i][::-1]]).tolist()
+            colour, half = colours[block][i], len(outline) // 2
+            self._fill(outline, colour)
+            self._pg.draw.aalines(self._canvas, colour, False, outline[:half])
+            self._pg.draw.aalines(self._canvas, colour, False, outline[half:])
 
 
 def round_length(least: float) -> float:
@@ -649,30 +698,6 @@ def _grid_lines(view: View, step_mm: float, phase: float) -> tuple[list[int], li
     x = view.left + ((columns + phase) * step_mm - x_mm) * view.scale
     y = view.top + (y_mm - (rows + phase) * step_mm) * view.scale
     return x.astype(int).tolist(), y.astype(int).tolist()
-
-
-def _rectangle(width: float, length: float) -> np.ndarray:
-    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, length / 2)
-
-
-def _cross(arm: float, width: float) -> tuple[np.ndarray, np.ndarray]:
-    return _rectangle(2 * arm, width), _rectangle(width, 2 * arm)
-
-
-def _ring(radius: float, width: float) -> np.ndarray:
-    """A circle's line as one polygon: round outside, and back inside."""
-    return np.concatenate([(radius + width / 2) * CIRCLE, (radius - width / 2) * CIRCLE[::-1]])
-
-
-def _treads(radius_mm: float, angle: float) -> list[np.ndarray]:
-    """The marks that are on the upper side of a wheel, foreshortened; rolling moves them forwards."""
-    turns = (angle + 2 * math.pi * k / TREADS for k in range(TREADS))
-    return [
-        _rectangle(DRIVE_WHEEL_WIDTH_MM, 0.2 * radius_mm * math.cos(turn))
-        + (0, radius_mm * math.sin(turn))
-        for turn in turns
-        if math.cos(turn) > 0.1
-    ]
 
 
 def _length_text(length_mm: float) -> str:

@@ -1,20 +1,49 @@
 """Reference trajectories of the leader, with exact first and second derivatives.
 
-Every trajectory is a sum of sinusoids per axis, so that its derivatives are sums of sinusoids too.
-Heading as in the paper: θ* = atan2(−ẋ*, ẏ*), 0 facing +y, unwrapped over time.
+Heading as in the paper: θ* = atan2(−ẋ*, ẏ*), 0 facing +y, unwrapped over time. While the reference
+stands, its heading stays. The formulas and the limits of the robots are in ``docs/trajectories.md``.
 """
 
 from __future__ import annotations
 
 from abc import abstractmethod
-from typing import Annotated, Literal, NamedTuple
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, FiniteFloat
+from pydantic import Field, FiniteFloat, ValidationInfo, field_validator, model_validator
 
-from tlf_env.physics.parameters import Frozen, Positive
+from tlf_env.physics.parameters import Frozen, NonNegative, Positive
+from tlf_env.task.waypoints import Point, checked_points, drive_through, read_points
 
 REFERENCE_COLUMNS = ("x_mm", "y_mm", "theta_rad", "u_1_mm_s", "u_2_rad_s")
+
+STILL_MM_S = 1e-10  # below it a velocity has no direction: rounding
+NEARBY_S = 1e-5  # how long before such an instant the heading is taken
+
+
+class _Timed(Frozen):
+    """Where the reference is at every time."""
+
+    @abstractmethod
+    def derivatives(self, t_s: np.ndarray) -> np.ndarray:
+        """Position, velocity and acceleration: ``(3, 2, ...)`` in mm, mm/s, mm/s²."""
+
+    def tangent(
+        self, t_s: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """A vector along the heading and its rate of change, each ``(2, ...)``.
+
+        The velocity, given with the acceleration at ``t_s``; where that vanishes for an instant, the
+        one just before (at the start: just after).
+        """
+        still = np.hypot(*velocity) < STILL_MM_S
+        if not still.any():
+            return velocity, acceleration
+        starting = (t_s >= 0) & (t_s < NEARBY_S)
+        nearby = self.derivatives(np.where(starting, t_s + NEARBY_S, t_s - NEARBY_S))[1]
+        return np.where(still, nearby, velocity), np.where(still, 0.0, acceleration)
 
 
 class Sinusoid(NamedTuple):
@@ -33,7 +62,9 @@ def _derivative(terms: list[Sinusoid], t_s: np.ndarray, order: int) -> np.ndarra
     return total
 
 
-class _Harmonic(Frozen):
+class _Harmonic(_Timed):
+    """A sum of sinusoids per axis, so that its derivatives are sums of sinusoids too."""
+
     centre_x_mm: FiniteFloat = 0.0
     centre_y_mm: FiniteFloat = 0.0
 
@@ -90,17 +121,187 @@ class Rose(_Harmonic):
         )
 
 
-Trajectory = Annotated[Lissajous | Rose, Field(discriminator="type")]
+class Circle(_Harmonic):
+    """x = r cos(φ ± ω t) + x₀, y = r sin(φ ± ω t) + y₀, with ω = 2π/period or speed/r.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        (a ValueError) unless exactly one of ``period_s`` and ``speed_mm_s`` is given.
+    """
+
+    type: Literal["circle"] = "circle"
+    radius_mm: Positive
+    period_s: Positive | None = None
+    speed_mm_s: Positive | None = None
+    direction: Literal["counterclockwise", "clockwise"] = "counterclockwise"
+    phase_rad: FiniteFloat = 0.0  # φ: where it starts, from +x
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.period_s is None) == (self.speed_mm_s is None):
+            raise ValueError(
+                f"a circle needs either period_s or speed_mm_s, got period_s {self.period_s} "
+                f"and speed_mm_s {self.speed_mm_s}"
+            )
+        return self
+
+    def sinusoids(self) -> tuple[list[Sinusoid], list[Sinusoid]]:
+        """One term per axis."""
+        if self.speed_mm_s is not None:
+            rate = self.speed_mm_s / self.radius_mm
+        else:
+            rate = 2 * np.pi / (self.period_s or np.inf)
+        if self.direction == "clockwise":
+            rate = -rate
+        return (
+            [Sinusoid(self.radius_mm, rate, self.phase_rad + np.pi / 2)],
+            [Sinusoid(self.radius_mm, rate, self.phase_rad)],
+        )
 
 
-def sample(trajectory: Lissajous | Rose, t_s: np.ndarray) -> np.ndarray:
+class Waypoints(_Timed):
+    """A smooth curve through timed points, ``(t_s, x_mm, y_mm)`` each; the first time becomes 0.
+
+    ``file`` names a CSV file with the header ``t_s,x_mm,y_mm``. It is read at once into ``points`` and
+    then forgotten, so that a dumped model stands by itself. A relative name starts from the folder in
+    the validation context's ``folder``, or else from the working directory. The curve is the cubic
+    spline of :func:`tlf_env.task.waypoints.drive_through`: a point repeated at a later time is a stop
+    until then. After the last point the reference rests.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        (a ValueError) that names the point or the line, the value and what is allowed.
+    """
+
+    type: Literal["waypoints"] = "waypoints"
+    file: str | None = None
+    points: tuple[Point, ...] = ()
+
+    @model_validator(mode="before")
+    @classmethod
+    def _read(cls, data: Any, info: ValidationInfo) -> Any:
+        if not isinstance(data, Mapping):
+            return data
+        file, points = data.get("file"), data.get("points")
+        if (file is None) == (points is None):
+            raise ValueError("waypoints need either points or file")
+        if file is None:
+            return data
+        if not isinstance(file, str | Path):
+            raise ValueError(f"file must be a name, got {file!r:.60}")
+        folder = Path((info.context or {}).get("folder", ""))
+        return {**data, "file": None, "points": read_points(folder / file)}
+
+    @field_validator("points", mode="before")
+    @classmethod
+    def _check(cls, points: Any) -> tuple[Point, ...]:
+        if not isinstance(points, list | tuple):
+            raise ValueError(f"points must be a list of (t_s, x_mm, y_mm), got {points!r:.60}")
+        return checked_points(points, "points", lambda i: f"points[{i}]")
+
+    @model_validator(mode="after")
+    def _try(self) -> Self:
+        drive_through(self.points)
+        return self
+
+    @property
+    def end_s(self) -> float:
+        """Time of the last point."""
+        return self.points[-1][0]
+
+    def derivatives(self, t_s: np.ndarray) -> np.ndarray:
+        """Position, velocity and acceleration: ``(3, 2, ...)`` in mm, mm/s, mm/s²."""
+        return drive_through(self.points).derivatives(np.asarray(t_s, dtype=np.float64))
+
+    def tangent(
+        self, t_s: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The velocity; at rest, as it was when the motion ended (before any: as it will begin)."""
+        told_at = drive_through(self.points).told_at(t_s)
+        direction, rate = super().tangent(told_at, *self.derivatives(told_at)[1:])
+        return direction, np.where(told_at == t_s, rate, 0.0)
+
+
+Plain = Annotated[Lissajous | Rose | Circle | Waypoints, Field(discriminator="type")]
+
+
+class StopAndGo(_Timed):
+    """Another trajectory, ``path``, driven and stood on in turns: p(t) = path(q(t)), from rest.
+
+    In every ``drive_s`` the rate q̇ rises from 0 to 1 over ``ramp_s`` by the cubic 3x² − 2x³, stays,
+    and falls again in the same way; then q stands for ``stop_s``. Hence q̈ is continuous, and a cycle
+    covers drive_s − ramp_s of the path's own time.
+
+    Raises
+    ------
+    pydantic.ValidationError
+        (a ValueError) if two ramps do not fit into ``drive_s``.
+    """
+
+    type: Literal["stop_and_go"] = "stop_and_go"
+    path: Plain
+    drive_s: Positive
+    stop_s: NonNegative
+    ramp_s: Positive = 2.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if 2 * self.ramp_s > self.drive_s:
+            raise ValueError(f"ramp_s {self.ramp_s} must be at most half of drive_s {self.drive_s}")
+        return self
+
+    def warp(self, t_s: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """The path's time q (s), its rate q̇ (1) and q̈ (1/s)."""
+        t_s = np.asarray(t_s, dtype=np.float64)
+        ramp_s, cycle_s = self.ramp_s, self.drive_s + self.stop_s
+        cycle = np.floor(t_s / cycle_s)
+        t = np.clip(t_s - cycle * cycle_s, 0.0, self.drive_s)
+        up = np.minimum(t / ramp_s, 1.0)
+        down = np.minimum((self.drive_s - t) / ramp_s, 1.0)
+        area_up, area_down = (x**3 * (1 - x / 2) for x in (up, down))
+        rate_up, rate_down = (x**2 * (3 - 2 * x) for x in (up, down))
+        slope_up, slope_down = (6 * x * (1 - x) / ramp_s for x in (up, down))
+        q = t + ramp_s * (area_up - up - area_down + down - 0.5)
+        return (
+            cycle * (self.drive_s - ramp_s) + q,
+            rate_up * rate_down,
+            slope_up - slope_down,
+        )
+
+    def derivatives(self, t_s: np.ndarray) -> np.ndarray:
+        """Position, velocity and acceleration by the chain rule: ``(3, 2, ...)`` in mm, mm/s, mm/s²."""
+        q, rate, slope = self.warp(t_s)
+        position, velocity, acceleration = self.path.derivatives(q)
+        return np.stack([position, velocity * rate, acceleration * rate**2 + velocity * slope])
+
+    def tangent(
+        self, t_s: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """The path's own, at its time q: it does not depend on how fast the path is driven."""
+        q, rate, _ = self.warp(t_s)
+        direction, turning = self.path.tangent(q, *self.path.derivatives(q)[1:])
+        return direction, turning * rate
+
+
+Trajectory = Annotated[
+    Lissajous | Rose | Circle | Waypoints | StopAndGo, Field(discriminator="type")
+]
+
+
+def sample(trajectory: Trajectory, t_s: np.ndarray) -> np.ndarray:
     """Reference pose and twist ``(len(t_s), 5)``, columns as in :data:`REFERENCE_COLUMNS`.
 
     ``t_s`` is increasing; the heading is unwrapped along it. u₁* = √(ẋ² + ẏ²) and
-    u₂* = θ̇* = (ẋÿ − ẏẍ)/u₁*², 0 where the reference stands still.
+    u₂* = θ̇* = (ẋÿ − ẏẍ)/u₁*². Where the reference stands, u₁* and u₂* are 0 and θ* is the last
+    heading that it had, or before any motion the first one.
     """
-    (x, y), (v_x, v_y), (a_x, a_y) = trajectory.derivatives(t_s)
-    speed_2 = v_x**2 + v_y**2
-    turn = np.divide(v_x * a_y - v_y * a_x, speed_2, out=np.zeros_like(speed_2), where=speed_2 > 0)
-    theta = np.unwrap(np.arctan2(-v_x, v_y))
-    return np.stack([x, y, theta, np.sqrt(speed_2), turn], axis=-1)
+    t_s = np.asarray(t_s, dtype=np.float64)
+    (x, y), velocity, acceleration = trajectory.derivatives(t_s)
+    (d_x, d_y), (r_x, r_y) = trajectory.tangent(t_s, velocity, acceleration)
+    speed = np.sqrt(velocity[0] ** 2 + velocity[1] ** 2)
+    square = d_x**2 + d_y**2
+    turn = np.divide(d_x * r_y - d_y * r_x, square, out=np.zeros_like(square), where=square > 0)
+    theta = np.unwrap(np.arctan2(-d_x, d_y))
+    return np.stack([x, y, theta, speed, turn], axis=-1)

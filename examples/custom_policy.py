@@ -1,0 +1,72 @@
+"""A policy of one's own: pure pursuit of the previewed reference, with the ``predict`` of SB3.
+
+Shows how to read a ``tracking`` observation by name, and that anything with this ``predict`` drives a
+formation: in a loop of one's own, in :func:`baselines.run.run_policy`, and as ``others=`` of the
+Gymnasium environment.
+
+    python examples/custom_policy.py --horizon-s 100
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import typer
+
+from baselines import ReferencePolicy
+from baselines.run import run_policy
+from tlf_env import load_scenario
+from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
+from tlf_env.task.observation import tracking_entries
+
+PREVIEW_S = (0.5, 1.0)  # the default of the scenarios
+SPEED_GAIN_PER_S = 0.5
+NEAREST_MM = 20.0  # a target closer than this says nothing about where to turn
+
+
+class PurePursuit:
+    """Drive the arc through the place where the reference will be in half a second."""
+
+    privileged = False
+
+    def __init__(self) -> None:
+        entries = tracking_entries(PREVIEW_S)
+        self._place = {name: i for i, name in enumerate(entries)}
+        self._scale = np.array([entry.scale for entry in entries.values()])
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """``twist`` actions for one observation or a batch of them; there is nothing to remember."""
+        seen = observation * self._scale  # physical units
+        speed = (
+            seen[..., self._place["reference_u_1"]]
+            + SPEED_GAIN_PER_S * seen[..., self._place["e_1"]]
+        )
+        forward = seen[..., self._place["forward_in_0.5_s"]]
+        right = seen[..., self._place["right_in_0.5_s"]]
+        away = np.maximum(np.hypot(forward, right), NEAREST_MM)
+        yaw_rate = -2.0 * speed * right / away**2  # positive turns left
+        action = np.stack([speed / FULL_SPEED_MM_S, yaw_rate / FULL_YAW_RATE_RAD_S], axis=-1)
+        return np.clip(action, -1.0, 1.0).astype(observation.dtype), state
+
+
+def main(horizon_s: float = 100.0, seed: int = 0) -> None:
+    """Drive the ∞ and the flower with the paper's law and with pure pursuit."""
+    for task in ("infinity", "flower"):
+        scenario = load_scenario(task, horizon_s=horizon_s)
+        for policy in (ReferencePolicy(), PurePursuit()):
+            robots = run_policy(scenario, policy, seed).metrics()
+            errors = [
+                "lost" if robot.lost else f"{robot.position_rmse_mm:.2f}" for robot in robots
+            ]
+            print(f"{task}, {type(policy).__name__}: {', '.join(errors)} mm RMS")
+
+
+if __name__ == "__main__":
+    typer.run(main)

@@ -1,0 +1,233 @@
+"""Timed waypoints: read and checked, and the smooth motion through them.
+
+A waypoint is ``(t_s, x_mm, y_mm)``. Between waypoints that differ the motion is a cubic spline;
+from a waypoint to an equal one the reference stands, and it comes to rest and leaves smoothly there.
+"""
+
+from __future__ import annotations
+
+import csv
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from functools import lru_cache
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tlf_env.task.actions import FULL_SPEED_MM_S
+
+HEADER = ("t_s", "x_mm", "y_mm")
+MAX_POINTS = 100_000
+MAX_MAGNITUDE = 1e9  # s, mm
+DEFAULT_ROBOTS = 3
+FEW_POINTS = 4  # with so few the free ends are natural: not-a-knot would swing wide
+REST_SHARE = 0.25  # a free end slower than this share of its chord's speed is at rest
+HELD_MM = 1.0  # so near to a rest the heading is held: its direction would be mere rounding
+SEARCH_PARTS = 64  # of an interval, in the search for that distance
+
+Point = tuple[float, float, float]
+
+
+def read_points(path: Path) -> tuple[Point, ...]:
+    """The waypoints in a CSV file with the header ``t_s,x_mm,y_mm``; the first time becomes 0.
+
+    Raises
+    ------
+    ValueError
+        in one line that names the file, the line, the value and what is allowed.
+    """
+    try:
+        text = path.read_text(encoding="utf-8-sig")
+    except OSError as error:
+        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{path} is not UTF-8 text: {error}") from error
+    reader = csv.reader(text.splitlines())
+    lines: list[int] = []
+    rows: list[list[str]] = []
+    try:
+        for row in reader:
+            if any(cell.strip() for cell in row):
+                lines.append(reader.line_num)
+                rows.append([cell.strip() for cell in row])
+    except csv.Error as error:
+        raise ValueError(f"{path}, line {reader.line_num}: not CSV: {error}") from error
+    if not rows or tuple(rows[0]) != HEADER:
+        found = repr(",".join(rows[0]))[:60] if rows else "an empty file"
+        raise ValueError(f"{path}, line 1: the header must be {','.join(HEADER)}, got {found}")
+    return checked_points(rows[1:], str(path), lambda i: f"{path}, line {lines[i + 1]}")
+
+
+def checked_points(
+    rows: Sequence[Any], whole: str, place: Callable[[int], str]
+) -> tuple[Point, ...]:
+    """Rows of three numbers as waypoints, the first time subtracted.
+
+    ``whole`` names all of them and ``place(i)`` row i, for errors.
+
+    Raises
+    ------
+    ValueError
+        for a row that is not three finite numbers, fewer than two or too many rows, a time that does
+        not increase, no motion at all, or a distance that no robot covers in its time.
+    """
+    if not 2 <= len(rows) <= MAX_POINTS:
+        raise ValueError(f"{whole} must have 2 to {MAX_POINTS} waypoints, got {len(rows)}")
+    raw = [_numbers(row, place(i)) for i, row in enumerate(rows)]
+    points = [(t - raw[0][0], x, y) for t, x, y in raw]
+    for i in range(1, len(points)):
+        duration_s = points[i][0] - points[i - 1][0]
+        if duration_s <= 0:
+            raise ValueError(
+                f"{place(i)}: t_s {raw[i][0]:.17g} must be above {raw[i - 1][0]:.17g}, "
+                "the time before it"
+            )
+        distance_mm = math.dist(points[i][1:], points[i - 1][1:])
+        if distance_mm > FULL_SPEED_MM_S * duration_s:
+            raise ValueError(
+                f"{place(i)}: {distance_mm:.6g} mm from the waypoint before, in {duration_s:.6g} s, "
+                f"is {distance_mm / duration_s:.6g} mm/s; a robot can be asked for "
+                f"{FULL_SPEED_MM_S:g} at most"
+            )
+    if all(point[1:] == points[0][1:] for point in points):
+        raise ValueError(f"{whole}: all waypoints are at one place; at least two must differ")
+    return tuple(points)
+
+
+def _numbers(row: Any, place: str) -> Point:
+    if not isinstance(row, list | tuple) or len(row) != len(HEADER):
+        got = f"{len(row)}" if isinstance(row, list | tuple) else repr(row)[:60]
+        raise ValueError(f"{place}: needs {len(HEADER)} numbers, {','.join(HEADER)}, got {got}")
+    values = []
+    for name, cell in zip(HEADER, row, strict=True):
+        try:
+            value = math.nan if isinstance(cell, bool) else float(cell)
+        except (TypeError, ValueError):
+            value = math.nan
+        if not abs(value) <= MAX_MAGNITUDE:
+            raise ValueError(
+                f"{place}: {name} must be a number within ±{MAX_MAGNITUDE:g}, got {cell!r:.60}"
+            )
+        values.append(value)
+    return values[0], values[1], values[2]
+
+
+class Drive(NamedTuple):
+    """The motion through waypoints: a piecewise cubic, and the stretches in which it moves."""
+
+    position: Any  # scipy PPoly of (x, y), mm, from 0 to the last time
+    velocity: Any
+    acceleration: Any
+    end_s: float
+    from_s: np.ndarray  # (stretch,)
+    to_s: np.ndarray
+    first_s: np.ndarray  # up to here, and from last_s on, the heading is held
+    last_s: np.ndarray
+
+    def derivatives(self, t_s: np.ndarray) -> np.ndarray:
+        """Position, velocity, acceleration ``(3, 2, ...)``; at rest before 0 and after the end."""
+        inside = np.clip(t_s, 0.0, self.end_s)
+        out = np.stack([f(inside) for f in (self.position, self.velocity, self.acceleration)])
+        out[1:, inside != t_s] = 0.0
+        return np.moveaxis(out, -1, 1)
+
+    def told_at(self, t_s: np.ndarray) -> np.ndarray:
+        """When the heading at ``t_s`` was last told: ``t_s`` itself while it moves."""
+        stretch = np.maximum(np.searchsorted(self.from_s, t_s, side="left") - 1, 0)
+        return np.clip(t_s, self.first_s[stretch], self.last_s[stretch])
+
+
+@lru_cache(maxsize=8)
+def drive_through(points: tuple[Point, ...]) -> Drive:
+    """The motion through checked waypoints: a cubic spline for every stretch between two rests.
+
+    A stretch starts and ends with zero speed where it touches a rest. The ends of the whole are free
+    (not-a-knot; natural with at most four points), unless the speed there is so low or so much
+    against the chord that the motion must have begun or ended at rest.
+
+    Raises
+    ------
+    ValueError
+        if SciPy is missing.
+    """
+    try:
+        from scipy.interpolate import CubicSpline, PPoly
+    except ModuleNotFoundError as error:
+        raise ValueError("waypoints need SciPy (pip install scipy)") from error
+    table = np.array(points)
+    t, xy = table[:, 0], table[:, 1:]
+    stands = np.concatenate([[True], (xy[1:] == xy[:-1]).all(axis=1), [True]])
+    first, last = np.flatnonzero(np.diff(stands.astype(np.int8))).reshape(-1, 2).T
+    rests = np.stack([first > 0, last < len(t) - 1], axis=1)
+    cubic = np.zeros((4, len(t) - 1, 2))
+    cubic[3] = xy[:-1]
+    for k, (a, b) in enumerate(zip(first, last, strict=True)):
+        some_t, some_xy = t[a : b + 1], xy[a : b + 1]
+        spline = CubicSpline(some_t, some_xy, bc_type=_ends(rests[k], b - a))
+        slow = _slow_ends(some_t, some_xy, spline(some_t[[0, -1]], 1))
+        if (slow > rests[k]).any():
+            rests[k] |= slow
+            spline = CubicSpline(some_t, some_xy, bc_type=_ends(rests[k], b - a))
+        cubic[:, a:b] = spline.c
+    position = PPoly(cubic, t)
+    first_s, last_s = t[first], t[last]
+    for k, (a, b) in enumerate(zip(first, last, strict=True)):
+        if rests[k, 0]:
+            first_s[k] = _leaves(position, t[a : b + 1])
+        if rests[k, 1]:
+            last_s[k] = _leaves(position, t[a : b + 1][::-1])
+    return Drive(
+        position=position,
+        velocity=position.derivative(1),
+        acceleration=position.derivative(2),
+        end_s=float(t[-1]),
+        from_s=t[first],
+        to_s=t[last],
+        first_s=first_s,
+        last_s=np.maximum(first_s, last_s),
+    )
+
+
+def _ends(rests: np.ndarray, intervals: int) -> tuple[str, str]:
+    free = "natural" if intervals < FEW_POINTS else "not-a-knot"
+    left, right = ("clamped" if rest else free for rest in rests)
+    return left, right
+
+
+def _slow_ends(t: np.ndarray, xy: np.ndarray, velocity: np.ndarray) -> np.ndarray:
+    """Which of the two ends are at rest by their velocity (end, 2): else a heading would flip there."""
+    chord = np.stack([(xy[1] - xy[0]) / (t[1] - t[0]), (xy[-1] - xy[-2]) / (t[-1] - t[-2])])
+    return (velocity * chord).sum(axis=1) < REST_SHARE * (chord**2).sum(axis=1)
+
+
+def _leaves(position: Any, t: np.ndarray) -> float:
+    """When a motion is first ``HELD_MM`` from where it is at ``t[0]``; its middle if it never is."""
+    start = position(t[0])
+    for a, b in itertools.pairwise(t):
+        part = np.linspace(a, b, SEARCH_PARTS + 1)[1:]
+        far = np.hypot(*(position(part) - start).T) >= HELD_MM
+        if far.any():
+            return float(part[np.argmax(far)])
+    return float((t[0] + t[-1]) / 2)
+
+
+def scenario_of_waypoints(path: Path, control_period_s: float = 0.02) -> dict[str, Any]:
+    """A scenario of three robots along a CSV file's waypoints, to the last one's time.
+
+    ``horizon_s`` is rounded up to the control period.
+
+    Raises
+    ------
+    ValueError
+        in one line, as :func:`read_points`.
+    """
+    points = read_points(path)
+    steps = max(math.ceil(points[-1][0] / control_period_s - 1e-9), 1)
+    return {
+        "name": path.stem,
+        "robots": DEFAULT_ROBOTS,
+        "horizon_s": round(steps * control_period_s, 9),
+        "trajectory": {"type": "waypoints", "points": points},
+    }
