@@ -35,7 +35,7 @@ def interquartile_mean(values: np.ndarray) -> float:
     return float(trim_mean(np.ravel(values), 0.25))
 
 
-def interval(values: np.ndarray, statistic: Callable[[np.ndarray], float]) -> list[float] | None:
+def interval(values: np.ndarray, statistic: Callable[..., Any]) -> list[float] | None:
     """Bootstrap interval of a statistic of one sample, None of fewer than two values."""
     if len(values) < 2:
         return None
@@ -45,7 +45,7 @@ def interval(values: np.ndarray, statistic: Callable[[np.ndarray], float]) -> li
 
 
 def stratified_interval(
-    strata: Sequence[np.ndarray], statistic: Callable[..., float]
+    strata: Sequence[np.ndarray], statistic: Callable[..., Any]
 ) -> list[float] | None:
     """Bootstrap interval of a statistic of several samples, each resampled by itself."""
     if not strata or min(len(values) for values in strata) < 2:
@@ -220,7 +220,7 @@ def breaking_points(results: Results, cells: list[dict[str, Any]]) -> list[dict[
                 mine.sort(key=lambda cell: cell["sweep"])
                 failed = [1 - cell["success"]["share"] for cell in mine]
                 values = [cell["sweep"] for cell in mine]
-                row = {"policy": policy, "task": task, "disturbance": disturbance}
+                row: dict[str, Any] = {"policy": policy, "task": task, "disturbance": disturbance}
                 for share in LOSSES:
                     row[f"loses_{100 * share:g}_percent_at"] = crossing(values, failed, share)
                 out.append(row)

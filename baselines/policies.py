@@ -51,7 +51,7 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
         policy = load_part(name)()
         if not hasattr(policy, "predict"):
             raise ValueError(f"policy {name!r} has no predict()")
-        return policy  # type: ignore[no-any-return]
+        return policy
     raise ValueError(
         f"policy {name!r} is not one of {', '.join(policy_names())}, module:factory, FILE.zip"
     )
@@ -97,7 +97,7 @@ def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
             f"{path}: its observation has the shape {seen} and its action {given}; the scenario's "
             f"are {wanted} and {(ACTION_SIZE,)}"
         )
-    return model  # type: ignore[no-any-return]
+    return model
 
 
 def _algorithm_of(data: dict[str, object], path: Path) -> str:

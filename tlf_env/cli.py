@@ -95,7 +95,7 @@ def run(
     from baselines.policies import make_policy
     from baselines.run import run_policy, summary, write_mat, write_record
     from tlf_env.envs.parallel import checked_seed
-    from tlf_env.task.scenario import load_scenario
+    from tlf_env.task.scenario import load_scenario, scenario_warnings
 
     chosen = load_scenario(
         scenario,
@@ -109,6 +109,8 @@ def run(
         control_period_s=control_period_s,
         horizon_s=horizon_s,
     )
+    for line in scenario_warnings(chosen):
+        notes.print(f"tlf: note: {line}", markup=False, soft_wrap=True)
     checked_seed(seed)
     name = named_policy(policy, gains)
     driver = make_policy(name, chosen, trust=trust)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import warnings
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
@@ -21,12 +22,16 @@ from tlf_env.task.channels import PATHS
 from tlf_env.task.formation import STATE_SCALES, Formation
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.reward import RewardTerms
-from tlf_env.task.scenario import Scenario, load_scenario
+from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
 
 Agent = str
 Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
 RENDER_MODES = ["human", "rgb_array"]
 PETTINGZOO_TEST_OPTION = "options"  # what PettingZoo's own API test passes; means nothing
+
+
+class ReferenceWarning(UserWarning):
+    """The reference asks something that the robots cannot do."""
 
 
 class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
@@ -82,7 +87,9 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         if adversary is not None:
             overrides["adversary"] = True
         self.scenario = load_scenario(scenario, **overrides)
-        self.metadata = {
+        for line in scenario_warnings(self.scenario):
+            warnings.warn(line, ReferenceWarning, stacklevel=2)
+        self.metadata: dict[str, Any] = {
             "name": f"tlf_env/{self.scenario.name}-v0",
             "render_modes": RENDER_MODES,
             "is_parallelizable": True,

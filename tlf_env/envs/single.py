@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, ClassVar, Protocol
+from typing import Any, Protocol, cast
 
 import gymnasium
 import numpy as np
@@ -59,7 +59,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         for an unknown learner, key or value, in one line.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": RENDER_MODES, "render_fps": 50}
+    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
 
     def __init__(
         self,
@@ -92,17 +92,18 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @staticmethod
     def _make_driver(others: str | Predicts) -> Predicts | None:
+        if others == REFERENCE:
+            return None
+        driver: Any = others
         if isinstance(others, str):
-            if others == REFERENCE:
-                return None
             if ":" not in others:
                 raise ValueError(
                     f"others {others!r} is neither {REFERENCE!r} nor 'module:factory' nor an object"
                 )
-            others = load_part(others)()
-        if not hasattr(others, "predict"):
+            driver = load_part(others)()
+        if not hasattr(driver, "predict"):
             raise ValueError(f"others {others!r} has no predict()")
-        return others
+        return cast(Predicts, driver)
 
     @property
     def scenario(self) -> Scenario:
@@ -150,7 +151,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """The truth for critics; see :meth:`FormationParallelEnv.state`."""
         return self.formation_env.state()
 
-    def render(self) -> np.ndarray | None:  # type: ignore[override]
+    def render(self) -> np.ndarray | None:
         """A frame in mode ``rgb_array``, None in mode ``human``."""
         return self.formation_env.render()
 

@@ -80,7 +80,7 @@ def load_part(path: str) -> Factory:
             sys.path.remove(here)
     if not callable(target):
         raise ValueError(f"{path!r} is not callable; it must be a factory")
-    return target  # type: ignore[no-any-return]
+    return target
 
 
 def part_name(factory: Factory) -> str:

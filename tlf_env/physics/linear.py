@@ -80,13 +80,15 @@ def _rolling_motion(b: Body, forward: float, yaw: float, castor: float) -> Motio
 
 def _rates(b: Body, state: np.ndarray, torques_Nmm: np.ndarray) -> np.ndarray:
     motion = _rolling_motion(b, *state.tolist())
+    torque_l, torque_r = (torques_Nmm * MILLINEWTON_PER_NEWTON).tolist()
     after, _ = substep(
         b,
         motion,
         Contact(*(0.0,) * len(Contact._fields)),
         Floor(0.0, 0.0, 1.0, 1.0, 1.0),
         Push(0.0, 0.0, 0.0),
-        *(torques_Nmm * MILLINEWTON_PER_NEWTON).tolist(),
+        torque_l,
+        torque_r,
         STEP_S,
     )
     forward = -after.v_x * math.sin(0.5 * STEP_S * motion.w) + after.v_y * math.cos(

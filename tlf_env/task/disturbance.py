@@ -118,7 +118,7 @@ class Disturbance(Frozen):
     def signal(self, path: str) -> Signal:
         """The signal of a channel."""
         group, name = path.split(".")
-        return getattr(getattr(self, group), name)  # type: ignore[no-any-return]
+        return getattr(getattr(self, group), name)
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 
 import numpy as np
@@ -286,7 +287,8 @@ def _apart(a: Arrays, poses: np.ndarray, i: int, j: int) -> bool:
         x_mm, y_mm, theta = poses[r]
         centres.append((x_mm - ahead * np.sin(theta), y_mm + ahead * np.cos(theta)))
         room += a.bodies[drivers.BODY_OUTLINE, r, 0]
-    return bool(np.hypot(*np.subtract(*centres)) > room + START_MARGIN_MM)
+    (x_i, y_i), (x_j, y_j) = centres
+    return math.hypot(x_i - x_j, y_i - y_j) > room + START_MARGIN_MM
 
 
 def state_rows(a: Arrays) -> np.ndarray:

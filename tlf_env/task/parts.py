@@ -7,6 +7,7 @@ from typing import Any
 
 from tlf_env.onboard.observer import Message
 from tlf_env.onboard.parts import Factory, finite, load_part
+from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
 from tlf_env.task import drivers
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.arrays import Arrays, Sample, Sensors
@@ -82,7 +83,7 @@ class Parts:
             torques = finite(
                 loop.torque(wanted, measured), 2, f"robot_{r}: the wheel loop's torque()"
             )
-            a.commands[:, r, 0] = torques * drivers.MILLINEWTON_PER_NEWTON
+            a.commands[:, r, 0] = torques * MILLINEWTON_PER_NEWTON
 
     def estimate(self, a: Arrays, k: int) -> None:
         """Estimators: update with the readings of substep ``k``."""

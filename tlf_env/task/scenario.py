@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Mapping
 from pathlib import Path
@@ -18,11 +19,14 @@ from tlf_env.onboard.tracking import tracking_gains
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive, RobotParameters
 from tlf_env.task.disturbance import Disturbance
+from tlf_env.task.feasibility import warnings_for
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
 from tlf_env.task.trajectories import Trajectory
+from tlf_env.task.waypoints import scenario_of_waypoints
 
 PACKAGE = Path(__file__).resolve().parent.parent
 MAX_ROBOTS = 1000
+DEFAULT_CONTROL_PERIOD_S = 0.02
 SETTLE_FRACTION = 0.4
 DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
@@ -90,7 +94,7 @@ class Scenario(Frozen):
     start_spacing_mm: Positive = 300.0
 
     physics_period_s: Positive = 0.001
-    control_period_s: Positive = 0.02
+    control_period_s: Positive = DEFAULT_CONTROL_PERIOD_S
     horizon_s: Positive = 100.0
     plant: Literal["pymunk", "kinematic"] = "pymunk"
 
@@ -246,7 +250,8 @@ def load_scenario(
     Parameters
     ----------
     source
-        ``"infinity"`` or another preset, a path to a YAML file, a mapping, or a :class:`Scenario`.
+        ``"infinity"`` or another preset, a path to a YAML file or to a CSV file of waypoints
+        (``t_s,x_mm,y_mm``), a mapping, or a :class:`Scenario`.
     disturbance_level
         Overrides the level of whatever disturbance results.
     **overrides
@@ -257,33 +262,70 @@ def load_scenario(
     ValueError
         in one line that names the value and what is allowed.
     """
+    folder = Path()
     if isinstance(source, Scenario):
         data = source.model_dump()
     elif isinstance(source, Mapping):
         data = dict(source)
     else:
-        data = _read_source(source)
+        data = _read_source(source, overrides.get("control_period_s"))
+        folder = Path(source).parent
     for key, value in overrides.items():
         if value is not None:
             data[key] = _merged(data.get(key), value)
     if disturbance_level is not None:
         data["disturbance"] = _with_level(data.get("disturbance", {}), disturbance_level)
     try:
-        return Scenario.model_validate(data)
+        return Scenario.model_validate(data, context={"folder": folder})
     except ValidationError as error:
         raise ValueError(one_line(error)) from error
 
 
-def _read_source(source: str | Path) -> dict[str, Any]:
+def _read_source(source: str | Path, control_period_s: float | None) -> dict[str, Any]:
     text = str(source)
     if text in preset_names():
         return {"name": text, **read_yaml(presets_folder() / f"{text}.yaml")}
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
         return {"name": path.stem, **read_yaml(path)}
+    if path.suffix == ".csv":
+        return scenario_of_waypoints(path, control_period_s or DEFAULT_CONTROL_PERIOD_S)
     raise ValueError(
-        f"scenario {text!r} is neither a preset ({', '.join(preset_names())}) nor a .yaml file"
+        f"scenario {text!r} is neither a preset ({', '.join(preset_names())}), nor a .yaml file, "
+        "nor a .csv file of waypoints"
     )
+
+
+@functools.lru_cache(maxsize=64)
+def _warnings_for(*what: Any) -> tuple[str, ...]:
+    trajectory, robot, horizon_s, robots, time_gap_s, start_spacing_mm = what
+    return tuple(
+        warnings_for(
+            trajectory,
+            robot,
+            horizon_s,
+            robots=robots,
+            time_gap_s=time_gap_s,
+            start_spacing_mm=start_spacing_mm,
+        )
+    )
+
+
+def scenario_warnings(scenario: Scenario) -> list[str]:
+    """What the scenario's reference asks that its robots cannot do, a line each."""
+    lines = [
+        line
+        for robot in dict.fromkeys(scenario.robot_models)
+        for line in _warnings_for(
+            scenario.trajectory,
+            robot,
+            scenario.horizon_s,
+            scenario.robot_count,
+            scenario.time_gap_s,
+            scenario.start_spacing_mm,
+        )
+    ]
+    return list(dict.fromkeys(lines))
 
 
 def _merged(old: Any, new: Any) -> Any:
