@@ -14,6 +14,7 @@ import pymunk
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
+from tlf_env.envs.spec import documented
 from tlf_env.numerics.philox import MAX_SEED
 from tlf_env.onboard.parts import Factory, part_name
 from tlf_env.task.actions import ACTION_SIZE
@@ -34,28 +35,18 @@ class ReferenceWarning(UserWarning):
     """The reference asks something that the robots cannot do."""
 
 
+@documented
 class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     """Robots in a row follow each other one time gap apart; every robot is an agent.
 
     Agents ``robot_0`` (the leader, on the scenario's trajectory) to ``robot_{n-1}``; each follower's
     reference comes from its predecessor's broadcast of one gap ago. All act at every control step.
+    Actions, observations, rewards and infos: the tables below, which are made from the code.
 
-    Action
-        ``Box(−1, 1, (2,), float32)``. ``action="twist"``: forward speed (1 = 1000 mm/s) and yaw rate
-        (1 = 8 rad/s, counter-clockwise). ``action="wheel_speed"``: left and right wheel (1 = 25 rad/s).
-        Values outside are clipped and counted in ``info["clipped"]``.
-    Observation
-        ``Box(−10, 10, (n,), float32)``, the ``tracking`` observation: see
-        :data:`tlf_env.task.observation.TRACKING_ENTRIES` for each entry's meaning, unit and scale.
-        Made from what the robot knows on board: estimated pose, odometry, radio. Never the truth.
-    Reward
-        Weighted sum of :class:`tlf_env.task.reward.RewardTerms`.
-    End
-        For the whole formation at once: lost, touched (as ``end_on`` says) or the horizon. The robots
-        concerned are terminated, the others truncated; ``info["end"]`` tells why.
-    Info
-        The fields of :class:`tlf_env.task.arrays.Info`, ``reward`` (the unweighted terms),
-        ``disturbance`` (what acted), ``lost`` and ``touched`` (at any time so far), ``end``.
+    Observations are made from what the robot knows on board, never from the truth; their size does
+    not depend on the number of robots. An episode ends for the whole formation at once: when a robot
+    is lost or touches another (as ``end_on`` says), or at the horizon. The robots concerned are
+    terminated, the others truncated.
 
     Parameters
     ----------

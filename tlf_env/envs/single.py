@@ -10,6 +10,7 @@ import gymnasium
 import numpy as np
 
 from tlf_env.envs.parallel import RENDER_MODES, FormationParallelEnv
+from tlf_env.envs.spec import documented
 from tlf_env.onboard.parts import load_part
 from tlf_env.task.actions import ACTION_SIZE, RESIDUAL, TWIST
 from tlf_env.task.scenario import Scenario
@@ -30,11 +31,12 @@ class Predicts(Protocol):
         """Actions for a batch of observations, and the next state."""
 
 
+@documented
 class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One learner in a formation whose other robots are driven by a policy.
 
-    Action, observation, reward and info are those of the learner in
-    :class:`tlf_env.envs.parallel.FormationParallelEnv`. The episode is terminated if the learner is
+    Actions, observations, rewards and infos are those of the learner in
+    :class:`tlf_env.envs.parallel.FormationParallelEnv`: the tables below. The episode is terminated if the learner is
     lost or touches another robot, and truncated at the horizon or if another robot ends it.
 
     Parameters

@@ -11,17 +11,28 @@ SLIP_UNIT_MM_S = 100.0
 
 
 class RewardTerms(NamedTuple):
-    """Unweighted terms of one robot and one step."""
+    """Unweighted terms of one robot and one step; see :data:`REWARD_MEANINGS`."""
 
-    coarse: float  # e^(−e/100 mm), e the true position error to the robot's own reference
-    medium: float  # e^(−e/10 mm)
-    fine: float  # e^(−e/2 mm)
-    action_change: float  # |Δa|², a in units of the action space
-    action_size: float  # |a|²
-    slip: float  # largest slip speed of a drive wheel in the step, in units of 100 mm/s
-    lost: float  # 1 in the step in which the robot is lost
-    touched: float  # 1 in the step in which it touches another
+    coarse: float
+    medium: float
+    fine: float
+    action_change: float
+    action_size: float
+    slip: float
+    lost: float
+    touched: float
 
+
+REWARD_MEANINGS = {
+    "coarse": "e^(−e/100 mm), e the true position error to the robot's own reference",
+    "medium": "e^(−e/10 mm)",
+    "fine": "e^(−e/2 mm)",
+    "action_change": "|Δa|², a in units of the action space",
+    "action_size": "|a|²",
+    "slip": "largest slip speed of a drive wheel in the step, in units of 100 mm/s",
+    "lost": "1 in the step in which the robot is lost",
+    "touched": "1 in the step in which it first touches another",
+}
 
 DEFAULT_WEIGHTS = RewardTerms(0.5, 0.5, 0.5, -0.02, -0.005, -0.05, -20.0, -20.0)
 
