@@ -36,8 +36,9 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """One learner in a formation whose other robots are driven by a policy.
 
     Actions, observations, rewards and infos are those of the learner in
-    :class:`tlf_env.envs.parallel.FormationParallelEnv`: the tables below. The episode is terminated if the learner is
-    lost or touches another robot, and truncated at the horizon or if another robot ends it.
+    :class:`tlf_env.envs.parallel.FormationParallelEnv`: the tables below. The episode is terminated
+    if the learner is lost or touches another robot, and truncated at the horizon or if another robot
+    ends it.
 
     Parameters
     ----------

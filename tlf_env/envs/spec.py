@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 import inspect
+from collections.abc import Sequence
 from typing import TypeVar
 
 from tlf_env.task.actions import ACTION_ENTRIES
@@ -23,7 +24,7 @@ from tlf_env.task.reward import DEFAULT_WEIGHTS, REWARD_MEANINGS
 T = TypeVar("T", bound=type)
 
 
-def table(header: tuple[str, ...], rows: list[tuple[str, ...]]) -> str:
+def table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     """A Markdown table."""
     lines = [header, tuple("---" for _ in header), *rows]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
