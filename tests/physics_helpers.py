@@ -7,6 +7,7 @@ from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from tlf_env.numerics.compiled import driver
 from tlf_env.physics.kernel import substep
@@ -26,7 +27,9 @@ from tlf_env.physics.state import (
 
 DT_S = 0.001
 ROBOT = RobotParameters()
+WITHOUT_JOINT_FRICTION = RobotParameters(joint_friction=False)
 FLOOR = Floor(0.0, 0.0, 1.0, 1.0, 1.0)
+ICE = Floor(0.0, 0.0, 0.0, 0.0, 0.0)
 STILL = Motion(*[0.0] * len(Motion._fields))
 NO_MEMORY = Contact(*[0.0] * len(Contact._fields))
 
@@ -41,7 +44,7 @@ def record(
     floors: np.ndarray,
     dt: float,
 ) -> None:
-    """Fill ``motions`` and ``contacts`` (field, step, 1) from their first column on."""
+    """Fill ``motions`` and ``contacts`` (field, substep, 1) from their first column on."""
     robot = read_body(bodies, 0, 0)
     for k in range(torques.shape[0]):
         floor = Floor(floors[k, 0], floors[k, 1], floors[k, 2], floors[k, 3], floors[k, 4])
@@ -61,13 +64,13 @@ def record(
 
 
 class Run(NamedTuple):
-    """Everything before the first and after every substep; fields are arrays over time."""
+    """The state before the first and after every substep: every field is an array over time."""
 
     motion: Motion
     contact: Contact
 
-    def last(self) -> tuple[Motion, Contact]:
-        return Motion(*(row[-1] for row in self.motion)), Contact(*(row[-1] for row in self.contact))
+    def at(self, k: int) -> tuple[Motion, Contact]:
+        return Motion(*(row[k] for row in self.motion)), Contact(*(row[k] for row in self.contact))
 
 
 def run(
@@ -76,15 +79,15 @@ def run(
     memory: Contact = NO_MEMORY,
     *,
     seconds: float,
-    torques_Nmm: object = (0.0, 0.0),
-    push: object = (0.0, 0.0, 0.0),
-    floor: object = FLOOR,
+    torques_Nmm: ArrayLike = (0.0, 0.0),
+    push: ArrayLike = (0.0, 0.0, 0.0),
+    floor: ArrayLike = FLOOR,
     dt_s: float = DT_S,
 ) -> Run:
-    """Drive one robot; torques (N·mm), push (mN, mN·mm) and floor are constant or one row a substep."""
+    """Drive a robot; torques (left, right), push (mN, mN, mN·mm) and floor: one row, or one a substep."""
     steps = round(seconds / dt_s)
 
-    def rows(values: object) -> np.ndarray:
+    def rows(values: ArrayLike) -> np.ndarray:
         array = np.asarray(values, dtype=np.float64)
         return np.ascontiguousarray(np.broadcast_to(array, (steps, array.shape[-1])))
 
@@ -98,45 +101,67 @@ def run(
 
 
 def rolling(robot: RobotParameters = ROBOT, forward: float = 0.0, yaw: float = 0.0) -> Motion:
-    """At the origin, heading along +y, every wheel rolling, the castor's fork where it trails."""
-    d, half = robot.com_offset_mm, robot.axle_width_mm / 2
-    radius = robot.wheel_radius_mm
-    base = robot.castor_pivot_mm
-    phi = -math.atan2(yaw * base, forward) if forward or yaw else 0.0
-    castor_speed = forward * math.cos(phi) - yaw * base * math.sin(phi)
+    """Heading along +y, the axle's midpoint at the origin, every wheel rolling, the castor trailing."""
+    phi = math.atan2(-yaw * robot.castor_pivot_mm, forward)
+    castor_speed = math.hypot(yaw * robot.castor_pivot_mm, forward)
+    turn = yaw * robot.axle_width_mm / 2
     return STILL._replace(
-        y=-d,
+        y=-robot.com_offset_mm,
         psi=phi,
-        v_x=yaw * d,
+        v_x=yaw * robot.com_offset_mm,
         v_y=forward,
         w=yaw,
         s=yaw,
-        omega_l=(forward - yaw * half) / radius,
-        omega_r=(forward + yaw * half) / radius,
+        omega_l=(forward - turn) / robot.wheel_radius_mm,
+        omega_r=(forward + turn) / robot.wheel_radius_mm,
         omega_c=castor_speed / robot.castor_radius_mm,
     )
 
 
-def forward_speed(motion: Motion) -> np.ndarray:
-    return -motion.v_x * np.sin(motion.theta) + motion.v_y * np.cos(motion.theta)
+def random_start(rng: np.random.Generator, scale: float = 1.0) -> Motion:
+    """Every velocity at random, so that most wheels slide; ``scale`` 1 is a fast robot."""
+    speeds = [300, 300, 2, 5, 10, 10, 20] * rng.normal(size=7) * scale
+    theta, psi = rng.uniform(-4, 4, 2)
+    return Motion(*rng.normal(size=2), theta, psi, *speeds, 0.0, 0.0)
 
 
-def kinetic_energy(robot: Body, motion: Motion) -> np.ndarray:
-    """In mN·mm."""
+def random_torques(rng: np.random.Generator, seconds: float, largest_Nmm: float) -> np.ndarray:
+    """Torques that jump every 50 ms, one row a substep."""
+    levels = rng.uniform(-largest_Nmm, largest_Nmm, (round(seconds / 0.05), 2))
+    return np.repeat(levels, 50, axis=0)
+
+
+def wheel_slip(robot: RobotParameters, motion: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """δ₁ and δ₂ of eq. (14) after every substep: the twist of c less what the drive wheels make of it.
+
+    Body axes are those at mid attitude, in which the kernel solves.
+    """
+    radius, width = robot.wheel_radius_mm, robot.axle_width_mm
+    middle = motion.theta[:-1] + motion.w[:-1] * DT_S / 2
+    after = Motion(*(x[1:] for x in motion))
+    forward = -after.v_x * np.sin(middle) + after.v_y * np.cos(middle)
+    delta_1 = forward - radius * (after.omega_l + after.omega_r) / 2
+    delta_2 = after.w - radius * (after.omega_r - after.omega_l) / width
+    return delta_1, delta_2
+
+
+def kinetic_energy(robot: RobotParameters | Body, motion: Motion) -> np.ndarray:
+    """Of all five bodies, in mN·mm; in the precision of ``motion``."""
+    r = body(robot) if isinstance(robot, RobotParameters) else robot
     return 0.5 * (
-        robot.m * (motion.v_x**2 + motion.v_y**2)
-        + robot.I * motion.w**2
-        + robot.I_s * motion.s**2
-        + robot.J * (motion.omega_l**2 + motion.omega_r**2)
-        + robot.J_c * motion.omega_c**2
+        r.m * (motion.v_x**2 + motion.v_y**2)
+        + r.I * motion.w**2
+        + r.I_s * motion.s**2
+        + r.J * (motion.omega_l**2 + motion.omega_r**2)
+        + r.J_c * motion.omega_c**2
     )
 
 
-def bisect(starts_to: Callable[[float], bool], low: float, high: float, width: float) -> float:
-    """Smallest value at which something starts, which it does not at ``low`` and does at ``high``."""
-    assert not starts_to(low)
-    assert starts_to(high)
+def first(starts: Callable[[float], bool], low: float, high: float, width: float) -> float:
+    """Smallest value, to within ``width``, at which something starts that does not at ``low``."""
+    assert not starts(low)
+    assert starts(high)
     while high - low > width:
         middle = 0.5 * (low + high)
-        low, high = (low, middle) if starts_to(middle) else (middle, high)
+        low, high = (low, middle) if starts(middle) else (middle, high)
     return 0.5 * (low + high)

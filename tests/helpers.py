@@ -1,0 +1,144 @@
+"""Shared by the tests: driving an environment, and comparing what it returns bit for bit."""
+
+from __future__ import annotations
+
+import hashlib
+import marshal
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from hypothesis import settings
+
+import tlf_env
+from baselines import ReferencePolicy
+from tlf_env.onboard.tracking import TrackingGains
+
+Actions = dict[str, np.ndarray]
+
+# The first call of a compiled law takes a second or so.
+untimed = settings(deadline=None)
+
+LOST_RMS_MM = 100.0
+SETTLED_FROM, TAIL_FROM = 0.4, 0.7  # fractions of a run
+
+
+@dataclass(frozen=True)
+class Run:
+    """A finished run, ends ignored: one row per control step, the start included."""
+
+    error_mm: np.ndarray  # (time, robot), true pose to the robot's own reference
+    heading_error_rad: np.ndarray  # (time, robot)
+    lost_at_once: np.ndarray  # (robot,) the error passed lost_beyond_mm
+    touched: np.ndarray  # (robot,)
+
+    @property
+    def rms_mm(self) -> np.ndarray:
+        """Settled error of each robot."""
+        return self.rms_between(SETTLED_FROM)
+
+    @property
+    def lost(self) -> np.ndarray:
+        """Which robots a table would call lost."""
+        return self.lost_at_once | (self.rms_between(TAIL_FROM) > LOST_RMS_MM)
+
+    def rms_between(self, first: float, last: float = 1.0) -> np.ndarray:
+        """RMS error of each robot between two fractions of the run."""
+        rows = len(self.error_mm)
+        return np.sqrt(np.mean(self.error_mm[int(first * rows) : int(last * rows)] ** 2, axis=0))
+
+
+def stacked(by_agent: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Observations of all agents as one batch."""
+    return np.stack(list(by_agent.values()))
+
+
+def unstacked(env: Any, rows: np.ndarray) -> Actions:
+    """A batch of actions as one for each agent."""
+    return dict(zip(env.possible_agents, np.asarray(rows, dtype=np.float32), strict=True))
+
+
+def alike(env: Any, action: tuple[float, float] = (0.0, 0.0)) -> Actions:
+    """The same action for every agent."""
+    return {agent: np.array(action, dtype=np.float32) for agent in env.possible_agents}
+
+
+def reference_actions(env: Any, observations: Mapping[str, np.ndarray]) -> Actions:
+    """What the reference controller does."""
+    return unstacked(env, ReferencePolicy().predict(stacked(observations))[0])
+
+
+def random_actions(rng: np.random.Generator) -> Callable[..., Actions]:
+    """Uniform actions from the whole action space, as a policy."""
+    return lambda env, _: unstacked(env, rng.uniform(-1, 1, (len(env.possible_agents), 2)))
+
+
+def drive(
+    scenario: str = "infinity",
+    gains: str | TrackingGains = "consistent",
+    seed: int = 0,
+    **overrides: Any,
+) -> Run:
+    """Run the reference controller over the whole horizon, whatever happens on the way."""
+    env = tlf_env.parallel_env(scenario, end_on=(), **overrides)
+    policy = ReferencePolicy(gains)
+    observations, infos = env.reset(seed=seed)
+    rows = [infos]
+    while env.agents:
+        actions = unstacked(env, policy.predict(stacked(observations))[0])
+        observations, _, _, _, infos = env.step(actions)
+        rows.append(infos)
+
+    def column(name: str) -> np.ndarray:
+        return np.array([[info[name] for info in row.values()] for row in rows])
+
+    return Run(
+        error_mm=column("position_error_mm"),
+        heading_error_rad=column("heading_error_rad"),
+        lost_at_once=column("lost")[-1],
+        touched=column("touched")[-1],
+    )
+
+
+def play(
+    env: Any,
+    observations: Mapping[str, np.ndarray],
+    steps: int | None = None,
+    policy: Callable[..., Actions] = reference_actions,
+) -> list[Any]:
+    """Everything that ``steps`` steps return (by default, all until the episode ends)."""
+    returned = []
+    while env.agents and (steps is None or len(returned) < steps):
+        returned.append(env.step(policy(env, observations)))
+        observations = returned[-1][0]
+    return returned
+
+
+def digest(value: Any) -> str:
+    """A hash of nested containers, arrays and numbers that changes with any bit of them."""
+    return hashlib.sha256(marshal.dumps(_plain(value), 2)).hexdigest()
+
+
+def _plain(value: Any) -> Any:
+    if isinstance(value, np.ndarray):
+        return str(value.dtype), value.shape, value.tobytes()
+    if isinstance(value, np.generic):
+        return str(value.dtype), value.tobytes()
+    if isinstance(value, dict):
+        return {key: _plain(item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(item) for item in value]
+    return value
+
+
+def whole_episode_digest(scenario: str, seed: int, **overrides: Any) -> str:
+    """Digest of everything that an episode of the reference controller returns."""
+    env = tlf_env.parallel_env(scenario, **overrides)
+    start = env.reset(seed=seed)
+    observations, digests = start[0], [digest(start)]
+    while env.agents:
+        step = env.step(reference_actions(env, observations))
+        observations = step[0]
+        digests.append(digest(step))
+    return digest(digests)

@@ -1,0 +1,245 @@
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+import pymunk
+import pytest
+from physics_helpers import DT_S, NO_MEMORY, ROBOT, STILL, kinetic_energy, rolling
+
+import tlf_env
+from tlf_env.physics.openloop import advance_open_loop
+from tlf_env.physics.parameters import RobotParameters, body_array
+from tlf_env.physics.pymunk_plant import COLLISION_SLOP_MM, ITERATIONS, PymunkPlant
+from tlf_env.physics.state import Motion
+
+OUTLINES_MM = 2 * ROBOT.outline_radius_mm
+AHEAD_MM = (
+    ROBOT.com_offset_mm - ROBOT.outline_offset_mm
+)  # of the outline's centre, from the centre of mass
+SPEED_MM_S = 300.0
+ON_ICE = RobotParameters(
+    tyre=ROBOT.tyre.model_copy(update={"mu_static": 0.0, "mu_dynamic": 0.0}), joint_friction=False
+)
+X, Y, THETA, V_X, V_Y, YAW, OMEGA_L = (
+    Motion._fields.index(name) for name in ("x", "y", "theta", "v_x", "v_y", "w", "omega_l")
+)
+PHASES_MM = np.arange(0, 0.6, 0.05)
+
+
+class Meeting(NamedTuple):
+    """What was recorded after every substep of several robots in one space."""
+
+    motions: np.ndarray  # (step, field, robot)
+    overlap_mm: np.ndarray  # of the outlines of robots 0 and 1
+    energy: np.ndarray  # (step, 2): after the kernel, after the space
+
+
+def energy_of(motions: np.ndarray) -> float:
+    return float(kinetic_energy(ROBOT, Motion(*motions[:, :, 0])).sum())
+
+
+def outline_centres(motions: np.ndarray) -> np.ndarray:
+    x, y, theta = motions[0, :, 0], motions[1, :, 0], motions[2, :, 0]
+    return np.stack([x - AHEAD_MM * np.sin(theta), y + AHEAD_MM * np.cos(theta)], axis=-1)
+
+
+def meet(starts: list[Motion], seconds: float, robot: RobotParameters = ROBOT) -> Meeting:
+    """Coast robots through kernel and space."""
+    plant = PymunkPlant([robot] * len(starts))
+    bodies, zero = body_array([robot]), np.zeros(3)
+    motions = np.array(starts).T[:, :, None].copy()
+    contacts = [np.array(NO_MEMORY).reshape(-1, 1, 1) for _ in starts]
+    steps = round(seconds / DT_S)
+    rows = np.empty((steps, len(Motion._fields), len(starts)))
+    overlap, energy = np.empty(steps), np.empty((steps, 2))
+    for k in range(steps):
+        before = motions.copy()
+        for i, contact in enumerate(contacts):
+            one = motions[:, i : i + 1].copy()
+            advance_open_loop(bodies, one, contact, np.zeros((1, 2)), zero, DT_S)
+            motions[:, i : i + 1] = one
+        after_kernel = energy_of(motions)
+        plant.collide(before, motions, DT_S)
+        energy[k] = after_kernel, energy_of(motions)
+        rows[k] = motions[:, :, 0]
+        centres = outline_centres(motions)
+        overlap[k] = OUTLINES_MM - math.dist(centres[0], centres[1])
+    return Meeting(rows, overlap, energy)
+
+
+def head_on(gap_mm: float) -> list[Motion]:
+    """Two robots that face each other, their outlines ``gap_mm`` apart."""
+    half = (gap_mm + OUTLINES_MM) / 2 + AHEAD_MM
+    one = rolling(forward=SPEED_MM_S)._replace(y=-half)
+    other = one._replace(y=half, theta=math.pi, psi=math.pi, v_y=-SPEED_MM_S)
+    return [one, other]
+
+
+@pytest.fixture(scope="module")
+def collisions() -> list[Meeting]:
+    """Head-on collisions whose first overlap falls all over a substep."""
+    return [meet(head_on(20.0 + phase), 1.0) for phase in PHASES_MM]
+
+
+def test_robots_that_collide_head_on_both_stop(collisions):
+    for made in collisions:
+        touch = np.argmax(made.overlap_mm > 0)
+        speeds = np.hypot(made.motions[:, V_X], made.motions[:, V_Y])
+        assert speeds[touch - 1].min() > 0.95 * SPEED_MM_S
+        assert speeds[touch + 1 :].max() < 1e-6
+        assert made.motions[-1, OMEGA_L].tolist() == [0.0, 0.0]
+
+
+def test_head_on_collision_overlaps_by_less_than_a_substep_of_closing_about_0_24_mm(collisions):
+    """Contact is seen at the first substep that overlaps: 0.24 mm is one of 0 to 0.6 mm."""
+    closing_mm = 2 * SPEED_MM_S * DT_S
+    deepest = np.array([made.overlap_mm.max() for made in collisions])
+    assert (deepest <= closing_mm + COLLISION_SLOP_MM).all()
+    assert deepest.min() < 0.24 < deepest.max()
+    assert deepest.mean() == pytest.approx(closing_mm / 2, abs=0.05)
+    for made in collisions:
+        assert made.overlap_mm[-1] <= 1.02 * COLLISION_SLOP_MM
+
+
+def test_head_on_collision_gains_no_energy(collisions):
+    for made in collisions:
+        start = 2 * float(kinetic_energy(ROBOT, rolling(forward=SPEED_MM_S)))
+        flow = np.concatenate([[start], made.energy.ravel()])
+        assert np.diff(flow).max() <= 1e-15 * start
+        touch = np.argmax(made.overlap_mm > 0)
+        assert made.energy[touch + 1, 1] < 0.1 * made.energy[touch - 1, 1]
+
+
+def test_head_on_collision_is_symmetric(collisions):
+    for made in collisions:
+        assert np.abs(made.motions[:, Y].sum(axis=1)).max() < 1e-6
+        assert np.abs(made.motions[:, 0]).max() < 1e-6
+
+
+@pytest.mark.parametrize("aside_mm", [0.0, 60.0, 150.0])
+def test_collision_conserves_momentum_where_the_floor_gives_none(aside_mm):
+    one = STILL._replace(y=-200.0, v_y=SPEED_MM_S)
+    other = STILL._replace(x=aside_mm, y=200.0, v_y=-0.5 * SPEED_MM_S, theta=math.pi)
+    made = meet([one, other], 1.5, ON_ICE)
+    assert made.overlap_mm.max() > 0
+    momentum = made.motions[:, [V_X, V_Y]].sum(axis=2)
+    assert momentum == pytest.approx(np.tile([0.0, 0.5 * SPEED_MM_S], (1500, 1)), abs=1e-9)
+    assert np.diff(made.energy.ravel()).max() <= 1e-12 * made.energy[0, 0]
+
+
+def by_chipmunk_alone(starts: list[Motion], steps: int) -> np.ndarray:
+    """x, y, angle of frictionless robots in a space of pymunk's own, (step, 3, robot)."""
+    space = pymunk.Space()
+    space.iterations, space.collision_slop = ITERATIONS, COLLISION_SLOP_MM
+    bodies = []
+    for start in starts:
+        one = pymunk.Body(ROBOT.mass_kg, ROBOT.body_inertia_kg_mm2)
+        outline = pymunk.Circle(one, ROBOT.outline_radius_mm, offset=(0.0, AHEAD_MM))
+        outline.friction = outline.elasticity = 0.0
+        space.add(one, outline)
+        one.angle, one.position = start.theta, (start.x, start.y)
+        one.velocity, one.angular_velocity = (start.v_x, start.v_y), start.w
+        bodies.append(one)
+    rows = np.empty((steps, 3, len(starts)))
+    for k in range(steps):
+        space.step(DT_S)
+        rows[k] = np.transpose([(*one.position, one.angle) for one in bodies])
+    return rows
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_without_the_floor_robots_collide_exactly_as_chipmunk_has_it(seed):
+    rng = np.random.default_rng(seed)
+    starts = [
+        STILL._replace(x=x, y=y, theta=theta, v_x=-x, v_y=-y, w=w)
+        for x, y, theta, w in zip(
+            [-130, 130, 0], [0, 10, 230], rng.uniform(-3, 3, 3), rng.uniform(-2, 2, 3), strict=True
+        )
+    ]
+    steps = 800
+    wanted = by_chipmunk_alone(starts, steps)
+    plant = PymunkPlant([ROBOT] * 3)
+    motions = np.array(starts).T[:, :, None].copy()
+    for k in range(steps):
+        before = motions.copy()
+        motions[[X, Y, THETA]] += motions[[V_X, V_Y, YAW]] * DT_S
+        plant.collide(before, motions, DT_S)
+        assert np.array_equal(motions[[X, Y, THETA], :, 0], wanted[k]), k
+    assert not np.allclose(motions[V_X, :, 0], [start.v_x for start in starts])
+
+
+def test_a_rebuilt_space_repeats_a_collision_bit_for_bit():
+    a, b = meet(head_on(20.0), 0.5), meet(head_on(20.0), 0.5)
+    assert np.array_equal(a.motions, b.motions)
+
+
+def test_a_reset_plant_has_forgotten_its_contacts():
+    plant = PymunkPlant([ROBOT, ROBOT])
+    results = []
+    for _ in range(2):
+        plant.reset()
+        motions = np.array(head_on(0.2)).T[:, :, None].copy()
+        for _ in range(5):
+            before = motions.copy()
+            motions[[X, Y]] += motions[[V_X, V_Y]] * DT_S
+            plant.collide(before, motions, DT_S)
+        results.append(motions)
+    assert np.array_equal(*results)
+
+
+def test_the_space_leaves_robots_that_do_not_touch_alone():
+    plant = PymunkPlant([ROBOT] * 3)
+    rng = np.random.default_rng(0)
+    motions = rng.normal(size=(len(Motion._fields), 3, 1)) * 100
+    motions[X] = [[-5000.0], [0.0], [5000.0]]
+    for _ in range(100):
+        before = motions.copy()
+        motions[[X, Y, THETA]] += motions[[V_X, V_Y, YAW]] * DT_S
+        kernel = motions.copy()
+        plant.collide(before, motions, DT_S)
+        assert np.array_equal(motions, kernel)
+
+
+def test_a_collision_far_away_changes_nothing_here():
+    bystander = rolling(forward=200.0, yaw=0.4)._replace(x=50_000.0)
+    made = meet([*head_on(20.0), bystander], 0.3)
+    alone = meet([bystander, STILL], 0.3)
+    assert np.array_equal(made.motions[:, :, 2], alone.motions[:, :, 0])
+
+
+def leader_states(robots: int, spacing_mm: float) -> np.ndarray:
+    """Motion, memory and estimate of robot_0 over time; the others stand still."""
+    env = tlf_env.parallel_env(robots=robots, start_spacing_mm=spacing_mm, end_on=())
+    env.reset(seed=3)
+    rng = np.random.default_rng(3)
+    arrays, rows = env.formation.arrays, []
+    actions = {agent: np.zeros(2) for agent in env.possible_agents}
+    for forward, turn in rng.uniform([0.0, -0.3], [0.5, 0.3], (150, 2)):
+        actions["robot_0"] = np.array([forward, turn])
+        env.step(actions)
+        states = (arrays.motions, arrays.contacts, arrays.estimates)
+        rows.append(np.concatenate([state[:, 0, 0] for state in states]))
+    assert not arrays.touched.any()
+    return np.array(rows)
+
+
+@pytest.mark.parametrize("spacing_mm", [221.0, 300.0, 5000.0], ids=["near", "preset", "far"])
+def test_robots_that_do_not_touch_change_nothing(spacing_mm):
+    """Near ones go through the space, far ones do not."""
+    assert np.array_equal(leader_states(3, spacing_mm), leader_states(1, spacing_mm))
+
+
+def test_injected_slip_at_level_zero_is_the_nominal_run_bit_for_bit():
+    slip = {"slip": {"delta_1_mm_s": 20.0, "delta_2_rad_s": 0.2}, "tyre": {"friction_scale": 0.5}}
+    disturbances = ["none", {**slip, "level": 0.0}, {**slip, "level": 1.0}]
+    envs = [tlf_env.parallel_env(robots=1, disturbance=one, end_on=()) for one in disturbances]
+    for env in envs:
+        env.reset(seed=0)
+    for action in np.random.default_rng(0).uniform(-1, 1, (50, 2)):
+        for env in envs:
+            env.step({"robot_0": action})
+    nominal, zero, disturbed = (env.formation.arrays.motions for env in envs)
+    assert np.array_equal(nominal, zero)
+    assert not np.array_equal(nominal, disturbed)

@@ -1,0 +1,298 @@
+from __future__ import annotations
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.patches import Circle
+
+from baselines import ReferencePolicy, figures
+from baselines.run import Record, run_policy
+from tlf_env import load_scenario
+
+ALL = {"overview", "paths", "errors", "functionals", "wheels", "slip", "time_gap"}
+UNITS = ("mm", "s", "rad", "mm/s", "rad/s", "N·mm", "mm·s", "rad·s")
+PNG = b"\x89PNG"
+
+
+class Away:
+    """Drives off the reference as fast as it can, turning all the time."""
+
+    def predict(self, observation: np.ndarray, *_: Any) -> tuple[np.ndarray, Any]:
+        return np.tile(np.float32([1.0, 0.35]), (len(observation), 1)), None
+
+
+@cache
+def record(kind: str) -> Record:
+    policy: Any = ReferencePolicy()
+    overrides: dict[str, Any] = {"robots": 3, "horizon_s": 7.0}
+    if kind == "lost":
+        policy, overrides = Away(), {"robots": 3, "horizon_s": 12.0, "lost_beyond_mm": 300.0}
+    elif kind == "before the first gap":
+        overrides = {"robots": 2, "horizon_s": 0.5}
+    elif kind == "one step":
+        overrides = {"robots": 2, "horizon_s": 0.02}
+    elif kind.isdigit():
+        overrides["robots"] = int(kind)
+    return run_policy(load_scenario("flower", **overrides), policy, name="test")
+
+
+def drawn(figure: Figure) -> Figure:
+    FigureCanvasAgg(figure).draw()
+    return figure
+
+
+def robot_lines(axes: Axes) -> list[Any]:
+    return [line for line in axes.lines if str(line.get_label()).startswith("robot ")]
+
+
+@pytest.mark.parametrize(
+    ("kind", "names"),
+    [
+        ("1", ALL - {"time_gap"}),
+        ("3", ALL),
+        ("10", ALL),
+        ("lost", ALL),
+        ("before the first gap", ALL - {"time_gap"}),
+        ("one step", ALL - {"time_gap"}),
+    ],
+)
+@pytest.mark.filterwarnings("error")
+def test_every_figure_is_written_and_nothing_else(
+    kind: str, names: set[str], tmp_path: Path
+) -> None:
+    folder = tmp_path / "new" / "folder"
+    written = figures.write_figures(record(kind), folder)
+    assert set(written) == {folder / f"{name}.png" for name in names} == set(folder.iterdir())
+    assert all(path.read_bytes().startswith(PNG) for path in written)
+
+
+def test_a_run_is_drawn_alike_every_time_and_in_every_format(tmp_path: Path) -> None:
+    once, again = (
+        figures.write_figures(record("1"), tmp_path / name, formats=("png", "pdf"))
+        for name in ("once", "again")
+    )
+    assert {path.suffix for path in once} == {".png", ".pdf"}
+    assert [path.name for path in once] == [path.name for path in again]
+    assert [path.read_bytes() for path in once] == [path.read_bytes() for path in again]
+
+
+@pytest.mark.parametrize("kind", ["1", "3", "lost"])
+def test_every_axis_has_a_unit(kind: str) -> None:
+    with_unit = re.compile(rf" \(({'|'.join(UNITS)})\)$")
+    for name, draw in figures.FIGURES.items():
+        if name == "time_gap" and kind == "1":
+            continue
+        for axes in draw(record(kind)).axes:
+            assert with_unit.search(axes.get_ylabel()), (name, axes.get_ylabel())
+            below = axes.get_subplotspec()
+            if below is not None and below.is_last_row():
+                assert with_unit.search(axes.get_xlabel()), (name, axes.get_xlabel())
+
+
+@pytest.mark.parametrize("n", [1, 3, 10])
+def test_every_robot_has_its_lines(n: int) -> None:
+    run = record(str(n))
+    for name, panels in (("errors", 2), ("functionals", 4)):
+        axes = figures.FIGURES[name](run).axes
+        assert [len(robot_lines(panel)) for panel in axes] == [n] * panels
+    assert len(robot_lines(figures.paths(run).axes[0])) == n
+    assert [len(axes.lines) for axes in figures.wheels(run).axes] == [2, 2, 1, 1] * n
+    assert len(figures.slip(run).axes) == n
+    if n > 1:
+        gaps = figures.time_gap(run).axes
+        assert [len(robot_lines(axes)) for axes in gaps] == [1] * (n - 1)
+        assert [axes.get_ylabel().split("\n")[0] for axes in gaps] == [
+            f"robot {i}" for i in range(1, n)
+        ]
+
+
+def test_lines_show_what_was_recorded() -> None:
+    run = record("3")
+    position, heading = figures.errors(run).axes
+    for i, (line, other) in enumerate(
+        zip(robot_lines(position), robot_lines(heading), strict=True)
+    ):
+        np.testing.assert_array_equal(line.get_ydata(), run["position_error_mm"][:, i])
+        np.testing.assert_array_equal(other.get_ydata(), run["heading_error_rad"][:, i])
+    left, _, torque, _ = figures.wheels(run).axes[4:8]
+    np.testing.assert_array_equal(left.lines[0].get_ydata(), run["omega_l_command_rad_s"][:, 1])
+    np.testing.assert_array_equal(left.lines[1].get_ydata(), run["omega_l_rad_s"][:, 1])
+    np.testing.assert_array_equal(torque.lines[0].get_ydata(), run["torque_l_Nmm"][:, 1])
+    slip = figures.slip(run).axes[2].lines[0]
+    np.testing.assert_array_equal(slip.get_ydata(), run["slip_mm_s"][:, 2])
+    gap = robot_lines(figures.time_gap(run).axes[1])[0]
+    after = run.t_s >= run.scenario.time_gap_s
+    np.testing.assert_array_equal(gap.get_ydata(), run["time_gap_error_s"][after, 2])
+
+
+def test_the_functionals_are_shown_whole_and_from_the_settle_time_on() -> None:
+    run = record("3")
+    whole, _, late, _ = figures.functionals(run).axes
+    settled = run.t_s >= run.scenario.settle_s
+    J = run["J_mm_s"][:, 1]
+    np.testing.assert_array_equal(robot_lines(whole)[1].get_ydata(), J)
+    np.testing.assert_array_equal(robot_lines(late)[1].get_ydata(), J[settled] - J[settled][0])
+
+
+@pytest.mark.parametrize("kind", ["3", "lost"])
+def test_nothing_lies_beyond_the_limits(kind: str) -> None:
+    run = record(kind)
+    plane, position, gap = figures.overview(run).axes
+    for axes, columns in ((plane.get_xlim(), ("x_mm",)), (plane.get_ylim(), ("y_mm",))):
+        for column in columns:
+            assert axes[0] < run[column].min() - run.scenario.robot.outline_radius_mm
+            assert axes[1] > run[column].max() + run.scenario.robot.outline_radius_mm
+    assert position.get_ylim()[1] > run["position_error_mm"].max()
+    after = run.t_s >= run.scenario.time_gap_s
+    late = run["time_gap_error_s"][after, 1:]
+    assert gap.get_ylim()[0] <= late.min()
+    assert gap.get_ylim()[1] >= late.max()
+    limit = run.scenario.robot.torque_limit_Nmm
+    for axes in figures.wheels(run).axes:
+        data = np.concatenate([line.get_ydata() for line in axes.lines])
+        assert axes.get_ylim()[0] < data.min()
+        assert axes.get_ylim()[1] > data.max()
+        if axes.get_ylabel().startswith("torque"):
+            assert [(p.get_y(), p.get_height()) for p in axes.patches] == [(-limit, 2 * limit)]
+
+
+@pytest.mark.parametrize("name", ["overview", "paths", "errors", "functionals"])
+@pytest.mark.parametrize("kind", ["1", "3", "20", "20 lost"])
+def test_texts_stay_clear_of_the_axes_and_of_each_other(kind: str, name: str) -> None:
+    run = record(kind.split()[0])
+    if kind.endswith("lost"):  # the longest names
+        columns = {**run.columns, "position_error_mm": 1000 + run["position_error_mm"]}
+        run = replace(run, columns=columns, lost=np.ones(run.robots, dtype=bool))
+    figure = drawn(figures.FIGURES[name](run))
+    whole = figure.bbox
+    panels = [axes.get_window_extent() for axes in figure.axes]
+    for text in (figure.legends[0], figure._suptitle):  # type: ignore[attr-defined]
+        box = text.get_window_extent()
+        assert whole.x0 <= box.x0 < box.x1 <= whole.x1
+        assert whole.y0 <= box.y0 < box.y1 <= whole.y1
+        assert not any(box.overlaps(panel) for panel in panels)
+    if name in ("overview", "paths"):
+        times = [text.get_window_extent() for text in figure.axes[0].texts]
+        assert all(panels[0].x0 < t.x0 < t.x1 < panels[0].x1 for t in times)
+        assert all(panels[0].y0 < t.y0 < t.y1 < panels[0].y1 for t in times)
+        assert not any(a.overlaps(b) for a in times for b in times if a is not b)
+
+
+@pytest.mark.parametrize("kind", ["1", "3", "lost"])
+def test_robots_are_drawn_at_the_snapshots_and_each_time_is_named_once(kind: str) -> None:
+    run = record(kind)
+    plane = figures.overview(run).axes[0]
+    rows = figures.snapshot_rows(run)
+    assert rows[0] == len(run.t_s) - 1
+    assert [text.get_text() for text in plane.texts] == [f"{run.t_s[k]:g} s" for k in rows]
+    outlines = [patch for patch in plane.patches if isinstance(patch, Circle)]
+    assert len(outlines) == len(rows) * run.robots
+    assert {circle.get_radius() for circle in outlines} == {run.scenario.robot.outline_radius_mm}
+    parts = [part for part in plane.collections if isinstance(part, PolyCollection)]
+    assert len(parts) == len(outlines)
+    assert plane.get_aspect() == 1.0
+
+
+def test_snapshots_keep_their_distance() -> None:
+    run = record("1")
+    rows = figures.snapshot_rows(run)
+    assert len(rows) > 1
+    places = np.stack([run["x_mm"][rows, 0], run["y_mm"][rows, 0]], axis=-1)
+    apart = np.linalg.norm(places[:, None] - places, axis=-1)
+    assert (apart[~np.eye(len(rows), dtype=bool)] > 2 * run.scenario.robot.outline_radius_mm).all()
+
+
+@pytest.mark.parametrize(
+    ("theta", "castor", "left", "right", "wheel", "nose"),
+    [
+        (0.0, 0.0, (-78, 0), (78, 0), (0, -100), (0, 76)),  # faces +y
+        (np.pi / 2, 0.0, (0, -78), (0, 78), (100, 0), (-76, 0)),  # faces −x
+        (0.0, np.pi / 2, (-78, 0), (78, 0), (15, -85), (0, 76)),  # the fork turned to the left
+    ],
+)
+def test_bodies_are_to_scale_and_face_where_they_head(
+    theta: float, castor: float, left: Any, right: Any, wheel: Any, nose: Any
+) -> None:
+    run = record("1")
+    at = {"x_mm": 1000.0, "y_mm": -500.0, "theta_rad": theta, "castor_rad": castor}
+    columns = {**run.columns, **{name: np.full((1, 1), value) for name, value in at.items()}}
+    polygons = figures.body_polygons(replace(run, columns=columns), 0, 0)
+    polygons = [polygon - (1000.0, -500.0) for polygon in polygons]
+    for polygon, centre in zip(polygons, (left, right, wheel), strict=False):
+        np.testing.assert_allclose(polygon.mean(axis=0), centre, atol=1e-9)
+    np.testing.assert_allclose(polygons[3][2], nose, atol=1e-9)
+    lengths = [np.linalg.norm(polygon[2] - polygon[1]) for polygon in polygons[:3]]
+    np.testing.assert_allclose(lengths, [100.0, 100.0, 40.0])
+
+
+def test_a_lost_robot_is_called_lost_and_its_heading_is_not_drawn_across_the_wrap() -> None:
+    run = record("lost")
+    assert np.abs(np.diff(run["heading_error_rad"], axis=0)).max() > np.pi  # it does wrap
+    position, heading = figures.errors(run).axes
+    assert all(str(line.get_label()).endswith(", lost") for line in robot_lines(position))
+    assert "lost" in [text.get_text() for text in position.texts]
+    for line in robot_lines(heading):
+        steps = np.abs(np.diff(line.get_ydata()))
+        assert np.nanmax(steps) <= np.pi
+
+
+def test_the_settle_time_is_marked() -> None:
+    run = record("3")
+    _, position, gap = figures.overview(run).axes
+    for axes in (position, gap):
+        dashed = [line for line in axes.lines if line.get_linestyle() == "--"]
+        assert [set(line.get_xdata()) for line in dashed] == [{run.scenario.settle_s}]
+    assert position.texts[0].get_text().startswith(f"settle time {run.scenario.settle_s:g} s")
+
+
+def test_the_title_names_task_policy_disturbance_and_seed() -> None:
+    run = record("1")
+    assert figures.title(run) == "flower, policy test, disturbance nominal, seed 0"
+    half = load_scenario(run.scenario, disturbance_level=0.5)
+    assert "nominal × 0.5" in figures.title(replace(run, scenario=half))
+
+
+@pytest.mark.parametrize("count", [1, 10, 4000, 4001, 99_999])
+def test_thinning_keeps_the_ends_and_the_extremes(count: int) -> None:
+    t_s = np.arange(count) * 0.001
+    values = np.random.default_rng(count).normal(size=count)
+    kept_s, kept = figures.thinned(t_s, values)
+    assert len(kept) <= figures.MOST_POINTS + 2
+    assert (kept_s[0], kept_s[-1]) == (t_s[0], t_s[-1])
+    assert (kept.min(), kept.max()) == (values.min(), values.max())
+    np.testing.assert_array_equal(values[np.searchsorted(t_s, kept_s)], kept)
+
+
+@pytest.mark.parametrize("n", range(1, 21))
+def test_colours_and_markers_tell_robots_apart(n: int) -> None:
+    run = replace(record("1"), lost=np.zeros(n, dtype=bool))
+    colours = {tuple(figures.to_rgb(figures._colour(run, i))) for i in range(n)}
+    assert len(colours) == n
+    assert all(np.dot(c, (0.2126, 0.7152, 0.0722)) < 0.85 for c in colours)  # none lost on white
+
+
+def test_very_many_robots_get_a_spread_of_rows() -> None:
+    run = record("10")
+    assert len(figures.slip(run).axes) == 10
+    many = {name: np.tile(column, (1, 40)) for name, column in run.columns.items()}
+    crowd = replace(run, columns=many, lost=np.tile(run.lost, 40), touched=np.tile(run.touched, 40))
+    rows = figures.slip(crowd).axes
+    assert len(rows) == figures.MOST_SHOWN
+    assert rows[0].get_ylabel().startswith("robot 0\n")
+    assert rows[-1].get_ylabel().startswith("robot 399\n")
+
+
+def test_pyplot_is_left_alone() -> None:
+    code = "import sys, baselines.figures; sys.exit('matplotlib.pyplot' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

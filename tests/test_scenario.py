@@ -1,0 +1,371 @@
+"""The scenario: where it comes from, what it refuses, and how it prints."""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Iterator
+
+import pytest
+import yaml
+from pydantic import ValidationError
+
+import tlf_env
+from baselines import ReferencePolicy
+from tlf_env.task.scenario import Scenario, load_scenario, preset_names, presets_folder
+
+NAN, INF = math.nan, math.inf
+
+
+def refusal(*args, **kwargs) -> str:
+    """The message with which a scenario is refused: one line."""
+    with pytest.raises(ValueError, match=r"\S") as caught:
+        tlf_env.parallel_env(*args, **kwargs)
+    message = str(caught.value)
+    assert "\n" not in message.strip()
+    assert len(message) < 500
+    return message
+
+
+def written(tmp_path, text: str, name: str = "mine.yaml"):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+# Where it comes from
+
+
+def test_presets_are_there():
+    assert {"infinity", "flower"} <= set(preset_names())
+    disturbances = preset_names(presets_folder() / "disturbances")
+    assert {"nominal", "none"} <= set(disturbances)
+
+
+@pytest.mark.parametrize("name", preset_names())
+@pytest.mark.parametrize("disturbance", preset_names(presets_folder() / "disturbances"))
+def test_presets_load(name, disturbance):
+    scenario = load_scenario(name, disturbance=disturbance)
+    assert scenario.name == name
+    assert scenario.disturbance.name == disturbance
+
+
+def test_infinity_and_flower_are_the_papers():
+    infinity, flower = load_scenario("infinity"), load_scenario("flower")
+    assert (infinity.robots, infinity.time_gap_s, infinity.horizon_s) == (3, 5.0, 100.0)
+    assert (flower.robots, flower.time_gap_s, flower.horizon_s) == (5, 5.0, 150.0)
+    for scenario in (infinity, flower):
+        assert scenario.settle_s == pytest.approx(0.4 * scenario.horizon_s)
+        assert scenario.physics_period_s == 0.001
+        assert scenario.control_period_s == 0.02
+        assert scenario.start_spacing_mm == 300
+        assert scenario.observer.gain_per_s == 3
+        assert scenario.observer.smoothing_s == 5
+        assert scenario.ekf.fix_variance_mm2 == 0.2
+        assert scenario.lost_beyond_mm == 1200
+        assert scenario.disturbance.position.noise_std_mm**2 == pytest.approx(0.2)
+
+
+def test_robot_is_that_of_table_1():
+    robot = load_scenario("infinity").robot
+    assert (robot.mass_kg, robot.wheel_radius_mm, robot.axle_width_mm) == (1.245, 50, 156)
+    assert (robot.wheel_inertia_kg_mm2, robot.gravity_mm_s2) == (52.91, 9807)
+    assert (robot.torque_limit_Nmm, robot.tyre.mu_static, robot.tyre.mu_dynamic) == (
+        15,
+        0.073,
+        0.055,
+    )
+    for joint, arms in (
+        (robot.drive_joint, (0.15, 0.1, 12, 8, 36)),
+        (robot.castor_joint, (0.15, 0.1, 6.2, 3.025, 30)),
+        (robot.steering_joint, (0.05, 0.033, 2.5, 2.5, 3)),
+    ):
+        assert arms == (
+            joint.mu_static,
+            joint.mu_dynamic,
+            joint.friction_arm_mm,
+            joint.pin_radius_mm,
+            joint.bending_arm_mm,
+        )
+        assert joint.dynamic_speed_mm_s == 1.5 * joint.stiction_speed_mm_s == 1.5
+        assert joint.bending
+        assert joint.preload_Nmm == 0
+
+
+def test_a_scenario_passes_through_unchanged():
+    scenario = load_scenario("flower", robots=2)
+    assert load_scenario(scenario) == scenario
+    assert tlf_env.parallel_env(scenario).scenario == scenario
+
+
+def test_keywords_yaml_and_mapping_are_the_same(tmp_path):
+    by_keyword = load_scenario(
+        "infinity",
+        robots=4,
+        time_gap_s=3.0,
+        disturbance={"slip": {"delta_1_mm_s": 5.0}, "level": 0.5},
+        reward={"fine": 2.0},
+        ekf={"alpha_1": 1e-3},
+    )
+    text = yaml.safe_dump(
+        {
+            **yaml.safe_load((presets_folder() / "infinity.yaml").read_text(encoding="utf-8")),
+            "robots": 4,
+            "time_gap_s": 3.0,
+            "disturbance": {"slip": {"delta_1_mm_s": 5.0}, "level": 0.5},
+            "reward": {"fine": 2.0},
+            "ekf": {"alpha_1": 1e-3},
+        }
+    )
+    by_file = load_scenario(written(tmp_path, text, "infinity.yaml"))
+    assert by_file == by_keyword
+    assert load_scenario(str(written(tmp_path, text, "infinity.yaml"))) == by_keyword
+    assert load_scenario({"name": "infinity", **yaml.safe_load(text)}) == by_keyword
+
+
+def test_a_file_gives_its_name(tmp_path):
+    text = (presets_folder() / "flower.yaml").read_text(encoding="utf-8")
+    assert load_scenario(written(tmp_path, text, "roundabout.yml")).name == "roundabout"
+
+
+def test_none_leaves_the_presets_value():
+    assert load_scenario("flower", horizon_s=None, robots=None) == load_scenario("flower")
+
+
+def test_one_number_deep_inside_can_be_changed_alone():
+    whole = load_scenario("infinity").robot
+    changed = load_scenario("infinity", robot={"steering_joint": {"bending": False}}).robot
+    joint = whole.steering_joint.model_copy(update={"bending": False})
+    assert changed == whole.model_copy(update={"steering_joint": joint})
+
+
+def test_level_overrides_that_of_any_disturbance():
+    for disturbance in ("nominal", {"slip": {"delta_1_mm_s": 5.0}}, None):
+        scenario = load_scenario("infinity", disturbance=disturbance, disturbance_level=0.25)
+        assert scenario.disturbance.level == 0.25
+
+
+def test_reward_weights_not_named_keep_their_defaults():
+    changed = load_scenario("infinity", reward={"fine": 3.0}).reward
+    assert changed == {**load_scenario("infinity").reward, "fine": 3.0}
+
+
+# What it refuses
+
+
+@pytest.mark.parametrize(
+    ("overrides", "named"),
+    [
+        ({"robots": 0}, ("robots", "0")),
+        ({"robots": -3}, ("robots", "-3")),
+        ({"robots": 2.5}, ("robots", "2.5")),
+        ({"robots": "many"}, ("robots", "many")),
+        ({"time_gap_s": 5.01}, ("time_gap_s", "5.01", "0.02")),
+        ({"time_gap_s": 0.0}, ("time_gap_s", "0.0")),
+        ({"time_gap_s": -5.0}, ("time_gap_s", "-5.0")),
+        ({"horizon_s": 99.999}, ("horizon_s", "99.999")),
+        ({"horizon_s": 0}, ("horizon_s", "0")),
+        ({"horizon_s": 1e9}, ("horizon_s", "1000000000")),
+        ({"control_period_s": 0.0205}, ("control_period_s", "0.0205", "0.001")),
+        ({"control_period_s": 0.0005}, ("control_period_s", "0.0005", "0.001")),
+        ({"control_period_s": 0.0}, ("control_period_s", "0")),
+        ({"physics_period_s": 0.003}, ("control_period_s", "0.02", "0.003")),
+        ({"physics_period_s": -0.001}, ("physics_period_s", "-0.001")),
+        ({"preview_s": (0.505,)}, ("preview_s", "0.505")),
+        ({"preview_s": (6.0,)}, ("preview_s", "6.0", "5.0")),
+        ({"preview_s": (-0.5,)}, ("preview_s", "-0.5")),
+        ({"start_spacing_mm": 200.0}, ("start_spacing_mm", "200", "220")),
+        ({"lost_beyond_mm": 0.0}, ("lost_beyond_mm", "0.0")),
+        ({"plant": "gazebo"}, ("plant", "gazebo", "pymunk", "kinematic")),
+        ({"action": "voltage"}, ("action", "voltage", "twist")),
+        ({"observation": "pixels"}, ("observation", "pixels", "tracking")),
+        ({"estimator": "ukf"}, ("estimator", "ukf", "ekf")),
+        ({"end_on": ("bored",)}, ("end_on", "bored", "lost")),
+        ({"disturbance": "storm"}, ("storm", "nominal")),
+        ({"disturbance": {"wind": {}}}, ("disturbance.wind", "unknown")),
+        ({"disturbance": {"slip": {"delta_9": 1.0}}}, ("disturbance.slip.delta_9", "unknown")),
+        ({"disturbance": {"tyre": {"friction_scale": -0.1}}}, ("friction_scale", "-0.1")),
+        ({"disturbance": {"position": {"noise_std_mm": -1.0}}}, ("noise_std_mm", "-1.0")),
+        (
+            {"disturbance": {"tyre": {"friction_scale": 0.5}, "level": 3.0}},
+            ("level", "3.0", "friction_scale"),
+        ),
+        ({"disturbance_level": -1.0}, ("level", "-1.0")),
+        ({"disturbance_level": NAN}, ("level", "nan")),
+        ({"disturbance_level": INF}, ("level", "inf")),
+        ({"disturbance_level": "high"}, ("level", "high")),
+        ({"reward": {"style": 1.0}}, ("reward", "style", "coarse")),
+        ({"reward": {"fine": NAN}}, ("reward", "fine", "nan")),
+        ({"reward": 3.0}, ("reward", "3.0")),
+        ({"robot": {"mass_kg": 0.0}}, ("robot.mass_kg", "0.0")),
+        ({"robot": {"mass_kg": NAN}}, ("robot.mass_kg", "nan")),
+        ({"robot": {"wheels": 4}}, ("robot.wheels", "unknown")),
+        ({"robot": {"com_offset_mm": 25.0}}, ("com_offset_mm", "25.0")),
+        ({"robot": {"torque_limit_Nmm": -15.0}}, ("torque_limit_Nmm", "-15")),
+        ({"ekf": {"fix_variance_mm2": 0.0}}, ("fix_variance_mm2", "0.0")),
+        ({"observer": {"gain_per_s": INF}}, ("gain_per_s", "inf")),
+        ({"wheel_loop": {"gain_Nmm_s": NAN}}, ("gain_Nmm_s", "nan")),
+        ({"trajectory": {"type": "spiral"}}, ("trajectory", "spiral", "rose")),
+        ({"tme_gap_s": 5.0}, ("tme_gap_s", "unknown")),
+        ({"render_mode": "hologram"}, ("render_mode", "hologram")),
+    ],
+)
+def test_an_impossible_value_is_refused_and_named(overrides, named):
+    message = refusal("infinity", **overrides)
+    for part in named:
+        assert part in message
+
+
+def test_a_preview_that_repeats_is_refused():
+    """Each time gives entries of its own to the observation, by name."""
+    with pytest.raises(ValueError, match="preview_s"):
+        load_scenario("infinity", preview_s=(0.5, 0.5))
+
+
+FLOATS = (
+    "time_gap_s",
+    "start_spacing_mm",
+    "physics_period_s",
+    "control_period_s",
+    "horizon_s",
+    "lost_beyond_mm",
+)
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+@pytest.mark.parametrize("name", FLOATS)
+def test_numbers_must_be_finite(name, value):
+    message = refusal("infinity", **{name: value})
+    assert name in message
+    assert str(abs(value)) in message
+
+
+@pytest.mark.parametrize("group", ["robot", "ekf", "observer", "wheel_loop"])
+def test_every_number_of_the_robot_and_its_controllers_must_be_finite(group):
+    model = getattr(load_scenario("infinity"), group)
+    for name, value in model.model_dump().items():
+        if isinstance(value, float):
+            message = refusal("infinity", **{group: {name: NAN}})
+            assert f"{group}.{name}" in message
+
+
+@pytest.mark.parametrize("curve", ["tyre", "drive_joint", "castor_joint", "steering_joint"])
+def test_friction_must_be_possible(curve):
+    whole = getattr(load_scenario("infinity").robot, curve).model_dump()
+    for change, named in (
+        ({"mu_static": -0.1}, "-0.1"),
+        ({"mu_static": NAN}, "nan"),
+        ({"mu_dynamic": 2.0}, "2.0"),
+        ({"dynamic_speed_mm_s": 0.5}, "0.5"),
+    ):
+        message = refusal("infinity", robot={curve: {**whole, **change}})
+        assert curve in message
+        assert named in message
+
+
+def test_an_unknown_preset_is_refused_with_the_presets_there_are():
+    message = refusal("lemniscate")
+    for part in ("lemniscate", "infinity", "flower"):
+        assert part in message
+
+
+def test_unknown_gains_are_refused_with_the_presets_there_are():
+    with pytest.raises(ValueError, match="heroic") as caught:
+        ReferencePolicy("heroic")
+    assert "consistent" in str(caught.value)
+    assert "printed" in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "robots: [3",
+        "a: b: c",
+        "- robots",
+        "just words",
+        "",
+        "\x00",
+        "robots: 3\n",  # no trajectory
+        "trajectory: {type: rose, amplitude_x_mm: 1, amplitude_y_mm: 1, period_s: .nan}",
+        "trajectory: {type: rose, amplitude_x_mm: 1, amplitude_y_mm: 1, period_s: 9}\nspeed: 3",
+    ],
+)
+def test_a_broken_file_is_refused(tmp_path, text):
+    refusal(written(tmp_path, text))
+
+
+def test_a_missing_file_is_refused_and_named(tmp_path):
+    assert "nowhere.yaml" in refusal(tmp_path / "nowhere.yaml")
+    assert "nowhere.yaml" in refusal(str(tmp_path / "nowhere.yaml"))
+
+
+def test_a_folder_is_no_file(tmp_path):
+    folder = tmp_path / "folder.yaml"
+    folder.mkdir()
+    assert "folder.yaml" in refusal(folder)
+
+
+def test_bytes_that_are_no_text_are_refused(tmp_path):
+    path = tmp_path / "binary.yaml"
+    path.write_bytes(b"\xff\xfe\x00\xd8robots")
+    assert "binary.yaml" in refusal(path)
+
+
+# What it is once made
+
+
+def test_scenario_is_frozen():
+    scenario = load_scenario("infinity")
+    for change in (
+        lambda: setattr(scenario, "robots", 5),
+        lambda: setattr(scenario.robot, "mass_kg", 2.0),
+        lambda: setattr(scenario.robot.tyre, "mu_static", 2.0),
+        lambda: setattr(scenario.disturbance.slip, "delta_1_mm_s", 2.0),
+        lambda: setattr(scenario.trajectory, "amplitude_x_mm", 2.0),
+    ):
+        with pytest.raises(ValidationError, match="frozen"):
+            change()
+
+
+def test_reward_weights_are_frozen_too():
+    scenario = load_scenario("infinity")
+    with pytest.raises(TypeError):
+        scenario.reward["fine"] = 99.0
+
+
+@pytest.mark.parametrize("name", preset_names())
+def test_scenario_survives_json(name):
+    scenario = load_scenario(name, disturbance={"slip": {"delta_2_rad_s": 0.1}, "level": 1 / 3})
+    assert Scenario.model_validate_json(scenario.model_dump_json()) == scenario
+    assert load_scenario(json.loads(scenario.model_dump_json())) == scenario
+
+
+def names_within(value) -> Iterator[str]:
+    if isinstance(value, dict):
+        for key, item in value.items():
+            yield key
+            yield from names_within(item)
+
+
+def test_the_environment_prints_the_whole_scenario():
+    scenario = tlf_env.parallel_env("flower", robots=2, time_gap_s=4.0).scenario
+    text = repr(scenario)
+    for name in names_within(scenario.model_dump()):
+        assert name in text
+    assert "time_gap_s=4.0" in text
+    assert "robots=2" in text
+
+
+def test_steps_follow_from_the_periods():
+    scenario = load_scenario("infinity", control_period_s=0.05, time_gap_s=0.15, preview_s=(0.1,))
+    assert (scenario.substeps, scenario.horizon_steps, scenario.gap_steps) == (50, 2000, 3)
+    assert scenario.preview_steps == (2,)
+
+
+def test_periods_divide_in_spite_of_rounding():
+    """In binary 0.06/0.006, 0.006/0.001 and 0.3/0.006 are not whole."""
+    scenario = load_scenario(
+        "infinity", control_period_s=0.006, time_gap_s=0.06, preview_s=(0.006,), horizon_s=0.3
+    )
+    assert (scenario.substeps, scenario.gap_steps, scenario.horizon_steps) == (6, 10, 50)
