@@ -62,9 +62,7 @@ def main(horizon_s: float = 100.0, seed: int = 0) -> None:
         scenario = load_scenario(task, horizon_s=horizon_s)
         for policy in (ReferencePolicy(), PurePursuit()):
             robots = run_policy(scenario, policy, seed).metrics()
-            errors = [
-                "lost" if robot.lost else f"{robot.position_rmse_mm:.2f}" for robot in robots
-            ]
+            errors = ["lost" if robot.lost else f"{robot.position_rmse_mm:.2f}" for robot in robots]
             print(f"{task}, {type(policy).__name__}: {', '.join(errors)} mm RMS")
 
 

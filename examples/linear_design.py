@@ -17,7 +17,7 @@ import numpy as np
 import typer
 
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
-from tlf_env.physics.linear import linearise
+from tlf_env.physics.linear import LinearPlant, linearise
 from tlf_env.physics.parameters import RobotParameters
 
 PERIOD_S = 0.001
@@ -31,31 +31,34 @@ def paper_plant(robot: RobotParameters) -> control.StateSpace:
     return control.ss(0.0, kappa, 1.0, 0.0)
 
 
-def mode(robot: RobotParameters, speed_mm_s: float, sign: float) -> control.StateSpace:
+def mode(plant: LinearPlant, states: slice, sign: float) -> control.StateSpace:
     """One mode of the wheels: torques (sign·τ, τ) to the mean of (sign·ω_l, ω_r)."""
-    plant = linearise(robot, speed_mm_s).to_control()
-    together = np.array([[sign], [1.0]])
-    return 0.5 * together.T * plant * together
+    together = np.array([sign, 1.0])
+    return control.ss(
+        plant.A[states, states],
+        plant.B[states] @ together,
+        0.5 * together @ plant.C[:, states],
+        0.0,
+    )
 
 
 def avc(p: WheelLoopParameters) -> control.StateSpace:
     """Eq. (13): K(s) in N·mm per rad/s."""
     return control.ss(
-        control.tf(
-            p.gain_Nmm_s * np.array([1.0, p.zeros_1, p.zeros_0]), [1.0, p.pole_rad_s, 0.0]
-        )
+        control.tf(p.gain_Nmm_s * np.array([1.0, p.zeros_1, p.zeros_0]), [1.0, p.pole_rad_s, 0.0])
     )
 
 
 def report(name: str, plant: control.StateSpace, loop: control.StateSpace) -> None:
     """Print what the loop makes of a plant."""
     open_loop = control.sample_system(loop, PERIOD_S) * control.sample_system(plant, PERIOD_S)
-    gain, phase, modulus, _, crossover, _ = control.stability_margins(open_loop)
+    response = control.frequency_response(open_loop, np.geomspace(0.01, np.pi / PERIOD_S, 2000))
+    _, phase, _, _, crossover, _ = control.stability_margins(response)
+    modulus = np.abs(1 + response.complex).min()
     closed = np.abs(control.feedback(open_loop, 1).poles())
-    at_1_rad_s = np.abs(plant(1j))
     print(
-        f"{name:13s} |G(1 rad/s)| {at_1_rad_s:.4f} rad/s per N·mm, crossover {crossover:6.1f} rad/s, "
-        f"gain margin {gain:5.1f}, phase margin {phase:4.1f}°, modulus margin {modulus:.2f}, "
+        f"{name:13s} |G(1 rad/s)| {np.abs(plant(1j)):.4f} rad/s per N·mm, crossover "
+        f"{crossover:6.1f} rad/s, phase margin {phase:4.1f}°, modulus margin {modulus:.2f}, "
         f"{'stable' if closed.max() < 1 else 'unstable'}"
     )
 
@@ -63,15 +66,15 @@ def report(name: str, plant: control.StateSpace, loop: control.StateSpace) -> No
 def main(speed_mm_s: float = 300.0, figure: Path | None = None) -> None:
     """Print the margins of the wheel loop; draw the open loops if a file is named."""
     robot, loop = RobotParameters(), avc(WheelLoopParameters())
+    straight = linearise(robot, speed_mm_s)
     plants = {
         "eq. (6)": paper_plant(robot),
-        "common": mode(robot, speed_mm_s, 1.0),
-        "differential": mode(robot, speed_mm_s, -1.0),
+        "common": mode(straight, slice(0, 1), 1.0),
+        "differential": mode(straight, slice(1, 3), -1.0),
     }
     for name, plant in plants.items():
         report(name, plant, loop)
-    yaw = linearise(robot, speed_mm_s).A[1:, 1:]
-    poles = ", ".join(f"{pole:+.2f}" for pole in np.linalg.eigvals(yaw).real)
+    poles = ", ".join(f"{pole:+.2f}" for pole in plants["differential"].poles().real)
     print(f"poles of yaw and castor without the loop at {speed_mm_s:g} mm/s: {poles} 1/s")
     if figure is not None:
         import matplotlib.pyplot as plt
@@ -80,6 +83,7 @@ def main(speed_mm_s: float = 300.0, figure: Path | None = None) -> None:
             [loop * plant for plant in plants.values()],
             omega_limits=(0.1, 1000.0),
             label=list(plants),
+            title="The open wheel loop",
         )
         plt.savefig(figure)
         print(f"open loops in {figure}")

@@ -12,7 +12,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 import typer
 from stable_baselines3 import PPO

@@ -8,7 +8,7 @@ from __future__ import annotations
 import math
 import os
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -18,10 +18,9 @@ from tlf_env.physics.state import Contact, Motion
 from tlf_env.task.arrays import Info, State
 from tlf_env.task.formation import Formation
 
-Mode = Literal["rgb_array", "human"]
 Colour = tuple[int, int, int]
 
-RENDER_MODES: tuple[Mode, ...] = ("rgb_array", "human")
+RENDER_MODES = ("rgb_array", "human")
 OVERSAMPLING = 2
 SOFT_PX = 0.7  # of the canvas: how far a soft edge reaches
 DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and grow with it
@@ -73,17 +72,19 @@ ARM_RADII = 0.25  # arms of the reference's cross
 MARGIN_RADII = 3.0  # room around the path, in outline radii
 MOST_START_MM = 1500.0  # how far the view grows towards robots that start off the path
 STILL_MM = 1e-3  # who went less has no direction
-TRAIL_POINTS, BLOCK = 100, 5  # of one trail; pieces of one colour in it
+TRAIL_POINTS, BLOCK = 96, 6  # of one trail; pieces of one colour in it
 PATH_POINTS = 1000
 TRAIL_PX, PATH_PX = 5.0, 2.0
 CLOSE_UP_PX, CLOSE_UP_RADII = 184, 3.2  # side of the close-up; how much floor, in outline radii
 CLOSE_UP_PEN = 1.3  # its lines against the others
-EDGE_PX, LINE_PX = 14, 18
+EDGE_PX, LINE_PX, TABLE_PX = 14, 18, 230
+PLATE_ALPHA = 190  # of the ground under the table
+SMALLEST_TEXT, SMALLEST_CLOSE_UP = 0.6, 0.6  # of their size in the design
 TEXT_PX, TIME_PX = 19, 27  # of pygame's own font, whose letters are two thirds of that
 GRID_PX = 90  # least side of a grid square
 COLUMNS_PX = (18, 140, 208, 218)  # name, error, time gap, flags
 
-CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 49)) for f in (np.cos, np.sin)], axis=-1)
+CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 37)) for f in (np.cos, np.sin)], axis=-1)
 NOSE = ((-0.26, 0.44), (0.26, 0.44), (0.0, 0.92))  # of what the outline is ahead of c
 
 
@@ -288,7 +289,7 @@ class Renderer:
         self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
         self._patches = list(patches)
         self._fps, self._trail_s = fps, trail_s
-        self._focus = None if close_up is None else min(close_up, len(robots) - 1)
+        self._close_up = None if close_up is None else min(close_up, len(robots) - 1)
         self._trail: list[tuple[float, np.ndarray]] = []  # time, (robot, 2)
         self._background: Any = None
         self._open, self._window = True, mode == "human"
@@ -311,8 +312,7 @@ class Renderer:
         self._canvas.blit(self._background, (0, 0))
         self._draw_robots(self._view, scene)
         self._draw_arrows(scene)
-        if self._focus is not None:
-            self._draw_close_up(self._focus, scene)
+        self._draw_close_up(scene)
         self._pg.transform.smoothscale(self._canvas, self._size_px, self._picture)
         self._write(scene)
         if self._window:
@@ -335,8 +335,10 @@ class Renderer:
         self._picture = pg.Surface(self._size_px, 0, 32)
         width, height = self._size_px
         self._unit = min(width / DESIGN_SIZE_PX[0], height / DESIGN_SIZE_PX[1])
+        self._text_unit = max(self._unit, SMALLEST_TEXT)
+        self._focus = self._close_up if self._unit >= SMALLEST_CLOSE_UP else None
         self._font, self._time_font, self._canvas_font = (
-            pg.font.Font(None, max(10, round(size * self._unit)))
+            pg.font.Font(None, round(size * self._text_unit))
             for size in (TEXT_PX, TIME_PX, TEXT_PX * OVERSAMPLING)
         )
         self._background = None
@@ -386,7 +388,7 @@ class Renderer:
     # Floor
 
     def _fit(self) -> View:
-        """The view of path and start. Spare width is left of them, where the text is."""
+        """The view of path and start: in the middle, or farther right, clear of the text."""
         room = MARGIN_RADII * max(robot.outline_radius_mm for robot in self._robots)
         low, high = self._path_mm.min(axis=0), self._path_mm.max(axis=0)
         start = np.clip(self._start_mm, low - MOST_START_MM, high + MOST_START_MM)
@@ -394,9 +396,11 @@ class Renderer:
         high = np.maximum(high, start.max(axis=0)) + room
         width, height = self._canvas.get_size()
         scale = min(width / (high[0] - low[0]), height / (high[1] - low[1]))
-        left = high[0] - width / scale
+        pen = OVERSAMPLING * self._unit
+        spare = width - (high[0] - low[0]) * scale
+        left = low[0] - max(spare / 2, min(spare, TABLE_PX * pen)) / scale
         top = (low[1] + high[1] + height / scale) / 2
-        return View(0, 0, width, height, (left, top), scale, OVERSAMPLING * self._unit)
+        return View(0, 0, width, height, (float(left), float(top)), float(scale), pen)
 
     def _draw_background(self) -> Any:
         self._view = self._fit()
@@ -425,7 +429,7 @@ class Renderer:
         colour = SLIPPERY if patch["scale"] < 1 else GRIPPY
         self._disc(centre, patch["radius_mm"] * view.scale, colour)
         if view is self._view:
-            self._label(f"µ × {patch['scale']:g}", center=(centre.x, centre.y))
+            self._label(f"µ × {patch['scale']:g}", colour, center=(centre.x, centre.y))
 
     def _draw_scale_bar(self, view: View, length_mm: float) -> None:
         pen, length = self._view.pen, length_mm * view.scale
@@ -437,9 +441,9 @@ class Renderer:
         text = f"{length_mm:g} mm" if length_mm < 1000 else f"{length_mm / 1000:g} m"
         self._label(text, midbottom=(x + length / 2, y - 4 * pen))
 
-    def _label(self, text: str, **anchor: Any) -> None:
+    def _label(self, text: str, ground: Colour = FLOOR, **anchor: Any) -> None:
         """Text on the canvas; ``anchor`` as pygame names a rectangle's points."""
-        image = self._canvas_font.render(text, True, INK)
+        image = self._canvas_font.render(text, True, INK, ground)
         self._canvas.blit(image, image.get_rect(**anchor))
 
     # Robots
@@ -540,7 +544,7 @@ class Renderer:
             x, y = np.clip(places[i], 5 * pen, size - 5 * pen).tolist()
             arrow = Place(x, y, math.atan2(-right, -down), pen)
             self._fill(arrow.px([(0, 0), (-7, -16), (7, -16)]), self._colours[i])
-            name = arrow.at(0, -28)
+            name = arrow.at(0, -28 - 22 * abs(math.sin(arrow.theta)))
             middle = min(max(name.x, 36 * pen), view.width - 36 * pen)
             self._label(f"robot_{i}", center=(middle, name.y))
 
@@ -559,7 +563,10 @@ class Renderer:
         pen = CLOSE_UP_PEN * self._view.pen
         return View(left, top, side, side, corner_mm, side / extent_mm, pen)
 
-    def _draw_close_up(self, i: int, scene: Scene) -> None:
+    def _draw_close_up(self, scene: Scene) -> None:
+        i = self._focus
+        if i is None or not math.isfinite(scene.x_mm[i] + scene.y_mm[i] + scene.theta_rad[i]):
+            return
         view = self._close_up_view(i, scene)
         self._canvas.set_clip(view.rect)
         step_mm = round_length(CLOSE_UP_RADII * self._robots[i].outline_radius_mm / 5)
@@ -591,19 +598,23 @@ class Renderer:
     # Text
 
     def _write(self, scene: Scene) -> None:
-        u = self._unit
-        time = self._time_font.render(f"t = {scene.t_s:.2f} s", True, INK)
-        self._picture.blit(time, (EDGE_PX * u, EDGE_PX * u))
+        u = self._text_unit
         top, bottom = (EDGE_PX + 1.7 * LINE_PX) * u, self._size_px[1] - EDGE_PX * u
         if self._focus is not None:
             bottom -= (CLOSE_UP_PX + 4 * LINE_PX) * u
-        rows = max(int((bottom - top) / (LINE_PX * u)), 1)
-        for i in range(min(len(self._robots), rows)):
+        rows = min(len(self._robots), max(int((bottom - top) / (LINE_PX * u)), 1))
+        plate = self._pg.Surface((TABLE_PX * u, top + rows * LINE_PX * u), self._pg.SRCALPHA)
+        plate.fill((*FLOOR, PLATE_ALPHA))
+        self._picture.blit(plate, (0, 0))
+        time = self._time_font.render(f"t = {scene.t_s:.2f} s", True, INK)
+        self._picture.blit(time, (EDGE_PX * u, EDGE_PX * u))
+        for i in range(rows):
             self._write_robot(scene, i, top + i * LINE_PX * u)
 
     def _write_robot(self, scene: Scene, i: int, y: float) -> None:
         """One line: colour, name, position error, time-gap error, what has happened."""
-        x, u = EDGE_PX * self._unit, self._unit
+        u = self._text_unit
+        x = EDGE_PX * u
         self._pg.draw.aacircle(self._picture, self._colours[i], (x + 5 * u, y + 6 * u), 5 * u)
         gap = f"{scene.time_gap_error_s[i]:+.3f} s" if i > 0 else ""
         flags = [name for name in ("lost", "touched") if getattr(scene, name)[i]]
@@ -689,7 +700,7 @@ def mixed(of: Colour, with_: Colour, part: float) -> Colour:
 
 
 def _grid_lines(view: View, step_mm: float, phase: float) -> tuple[list[int], list[int]]:
-    """Where the lines x and y = (k + phase)·step lie on the canvas."""
+    """Where the lines x and y = (k + phase)·step lie on the canvas, at whole px of the picture."""
     x_mm, y_mm = view.corner_mm
     columns = np.arange(math.floor(x_mm / step_mm), (x_mm + view.width / view.scale) / step_mm)
     rows = np.arange(
@@ -697,7 +708,9 @@ def _grid_lines(view: View, step_mm: float, phase: float) -> tuple[list[int], li
     )
     x = view.left + ((columns + phase) * step_mm - x_mm) * view.scale
     y = view.top + (y_mm - (rows + phase) * step_mm) * view.scale
-    return x.astype(int).tolist(), y.astype(int).tolist()
+    whole = ((axis / OVERSAMPLING).round().astype(int) * OVERSAMPLING for axis in (x, y))
+    columns_px, rows_px = (axis.tolist() for axis in whole)
+    return columns_px, rows_px
 
 
 def _length_text(length_mm: float) -> str:

@@ -1,0 +1,361 @@
+from __future__ import annotations
+
+import builtins
+import math
+import os
+import subprocess
+import sys
+import textwrap
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from tlf_env.envs.rendering import ALARM, FLOOR, Renderer, Scene, robot_colours, round_length
+from tlf_env.physics.parameters import RobotParameters
+
+pygame = pytest.importorskip("pygame")
+
+ANGLES = np.linspace(0, 2 * np.pi, 400)
+PATH_MM = 2000 * np.stack([np.sin(ANGLES), np.sin(2 * ANGLES)], axis=-1)
+BARE = {"close_up": None, "size_px": (480, 360)}
+
+
+def make_renderer(robots: int = 3, **options: Any) -> Renderer:
+    defaults: dict[str, Any] = {"mode": "rgb_array", "fps": 50.0}
+    return Renderer([RobotParameters()] * robots, PATH_MM, **(defaults | options))
+
+
+def make_scene(robots: int = 3, t_s: float = 0.0, **changes: Any) -> Scene:
+    """Robots 300 mm apart on the x axis, heading along it, on their references; no ghosts."""
+    zeros = np.zeros(robots)
+    x_mm = 500.0 - 300.0 * np.arange(robots)
+    fields = dict.fromkeys(Scene._fields, zeros) | {
+        "t_s": t_s,
+        "x_mm": x_mm,
+        "theta_rad": np.full(robots, -math.pi / 2),
+        "reference_x_mm": x_mm,
+        "reference_theta_rad": np.full(robots, -math.pi / 2),
+        "lost": np.zeros(robots, dtype=bool),
+        "touched": np.zeros(robots, dtype=bool),
+    }
+    for axis in ("x_mm", "y_mm", "theta_rad"):
+        fields[f"ghost_{axis}"] = np.full(robots, np.nan)
+    return Scene(**(fields | changes))
+
+
+def frame(renderer: Renderer, scene: Scene) -> np.ndarray:
+    drawn = renderer.draw(scene)
+    assert drawn is not None
+    return drawn
+
+
+def draw(scene: Scene, **options: Any) -> np.ndarray:
+    return frame(make_renderer(len(scene.x_mm), **options), scene)
+
+
+def count(image: np.ndarray, colour: tuple[int, int, int], tolerance: int = 40) -> int:
+    return int((np.abs(image.astype(int) - colour).max(axis=-1) <= tolerance).sum())
+
+
+@pytest.mark.parametrize("robots", [1, 2, 10, 40])
+@pytest.mark.parametrize("size_px", [(960, 720), (320, 500), (64, 64)])
+def test_frames_are_arrays_of_the_size_asked_for(robots: int, size_px: tuple[int, int]) -> None:
+    image = draw(make_scene(robots), size_px=size_px)
+    assert image.shape == (size_px[1], size_px[0], 3)
+    assert image.dtype == np.uint8
+    assert image.std() > 0
+
+
+def test_frames_are_fresh_and_writable() -> None:
+    renderer = make_renderer()
+    first = frame(renderer, make_scene())
+    kept = first.copy()
+    second = frame(renderer, make_scene(t_s=0.1, x_mm=np.array([900.0, 600.0, 300.0])))
+    assert np.array_equal(first, kept)
+    assert not np.array_equal(first, second)
+    second[:] = 0
+
+
+def test_equal_scenes_give_equal_frames() -> None:
+    assert np.array_equal(draw(make_scene()), draw(make_scene()))
+
+
+def test_arrays_need_no_display() -> None:
+    code = """
+        import pygame
+        from tests.test_rendering import draw, make_scene
+        draw(make_scene())
+        assert not pygame.display.get_init()
+    """
+    environment = {k: v for k, v in os.environ.items() if k not in ("DISPLAY", "WAYLAND_DISPLAY")}
+    path = os.pathsep.join([str(Path.cwd()), *sys.path])
+    result = subprocess.run(
+        [sys.executable, "-c", textwrap.dedent(code)],
+        env={**environment, "SDL_VIDEODRIVER": "no such driver", "PYTHONPATH": path},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert result.returncode == 0, result.stderr
+    assert result.stdout == ""
+
+
+def test_robots_are_where_the_scene_says_and_to_scale() -> None:
+    scene = make_scene(1)
+    with_robot = draw(scene, **BARE)
+    without = draw(scene._replace(x_mm=np.array([np.nan])), **BARE)
+    rows, columns = np.nonzero((with_robot != without).any(axis=-1))
+    px_per_mm = 360 / (4000 + 6 * 110)  # the path's height and the margins fill the picture
+    in_picture = rows > 60  # below the text
+    for pixels in (rows[in_picture], columns[in_picture]):
+        assert np.ptp(pixels) + 1 == pytest.approx(220 * px_per_mm, abs=4)
+    assert rows[in_picture].mean() == pytest.approx(180, abs=2)
+
+
+@pytest.mark.parametrize("wheel", ["l", "r", "c"])
+def test_a_slipping_wheel_is_marked_the_stronger_the_faster(wheel: str) -> None:
+    marks = [
+        count(draw(make_scene(1, **{f"slip_{wheel}_mm_s": np.array([slip])})), ALARM)
+        for slip in (0.0, 1.9, 60.0)
+    ]
+    rolling, below_threshold, fast = marks
+    assert rolling == below_threshold < fast
+    slow, faster = (
+        draw(make_scene(1, **{f"slip_{wheel}_mm_s": np.array([slip])})) for slip in (5.0, 30.0)
+    )
+    assert (slow != faster).any()
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"wheel_angle_l_rad": np.full(3, 0.5)},
+        {"wheel_angle_r_rad": np.full(3, 0.5)},
+        {"castor_rad": np.full(3, 1.0)},
+        {"theta_rad": np.zeros(3)},
+        {"reference_y_mm": np.full(3, 100.0)},
+        {"reference_theta_rad": np.full(3, 0.7)},
+        {"position_error_mm": np.full(3, 12.3)},
+        {"time_gap_error_s": np.full(3, -0.2)},
+        {"lost": np.array([False, True, False])},
+        {"touched": np.array([False, True, False])},
+        {"t_s": 1.0},
+    ],
+    ids=lambda change: next(iter(change)),
+)
+def test_everything_in_a_scene_shows(change: dict[str, Any]) -> None:
+    assert (draw(make_scene()) != draw(make_scene(**change))).any()
+
+
+def test_ghosts_of_followers_show_in_their_colour() -> None:
+    nowhere = np.full(3, np.nan)
+    there = make_scene(
+        ghost_x_mm=np.array([np.nan, 0.0, np.nan]),
+        ghost_y_mm=nowhere * 0 + 1000.0,
+        ghost_theta_rad=np.zeros(3),
+    )
+    colour = robot_colours(3)[1]
+    assert count(draw(there, **BARE), colour) > count(draw(make_scene(), **BARE), colour) + 10
+
+
+def test_trails_grow_and_a_new_episode_forgets_them() -> None:
+    renderer = make_renderer(1, **BARE)
+    colour = robot_colours(1)[0]
+    fresh = [frame(renderer, make_scene(1))]
+    counts = []
+    for k in range(1, 6):
+        x_mm = np.array([500.0 + 200.0 * k])
+        counts.append(count(frame(renderer, make_scene(1, k * 1.0, x_mm=x_mm)), colour, 60))
+    assert counts == sorted(set(counts))
+    fresh.append(frame(renderer, make_scene(1)))
+    assert np.array_equal(*fresh)
+
+
+def test_trails_end_after_their_time() -> None:
+    moved = {"x_mm": np.array([-1500.0])}
+    renderer = make_renderer(1, trail_s=2.0, **BARE)
+    frame(renderer, make_scene(1))
+    for t_s in (10.0, 11.0, 12.1):
+        image = frame(renderer, make_scene(1, t_s, **moved))
+    lone = frame(make_renderer(1, **BARE), make_scene(1))
+    start = slice(170, 190), slice(270, 290)
+    assert lone[start].min() < 150  # a robot stood there
+    assert count(image[start], robot_colours(1)[0], 60) == 0
+
+
+def test_long_trails_stay_short_in_memory() -> None:
+    renderer = make_renderer(1, trail_s=1.0, size_px=(64, 64))
+    for k in range(1000):
+        frame(renderer, make_scene(1, 0.02 * k))
+    assert len(renderer._trail) < 110
+
+
+@pytest.mark.parametrize(
+    ("x_mm", "y_mm"), [(9000, 0), (-9000, 0), (0, 9000), (0, -9000), (1e9, 1e9), (-1e300, 0)]
+)
+def test_a_robot_that_leaves_shows_as_an_arrow_at_the_edge(x_mm: float, y_mm: float) -> None:
+    renderer = make_renderer(1, **BARE)
+    frame(renderer, make_scene(1))
+    image = frame(renderer, make_scene(1, 0.1, x_mm=np.array([x_mm]), y_mm=np.array([y_mm])))
+    inside = image[12:-12, 12:-12]
+    colour = robot_colours(1)[0]
+    assert count(image, colour, 60) > count(inside, colour, 60)
+
+
+def test_values_that_are_not_numbers_do_no_harm() -> None:
+    nowhere = np.full(3, np.nan)
+    scene = make_scene(x_mm=nowhere, theta_rad=nowhere, slip_l_mm_s=nowhere, reference_x_mm=nowhere)
+    renderer = make_renderer()
+    frame(renderer, make_scene())
+    frame(renderer, scene._replace(t_s=0.1))
+    frame(renderer, scene._replace(t_s=0.2, position_error_mm=nowhere))
+    assert make_renderer().draw(scene) is not None
+
+
+def test_patches_shade_the_floor() -> None:
+    patch = {"x_mm": 0.0, "y_mm": 1200.0, "radius_mm": 300.0}
+    bare = draw(make_scene())
+    slippery = draw(make_scene(), patches=[{**patch, "scale": 0.5}])
+    grippy = draw(make_scene(), patches=[{**patch, "scale": 1.5}])
+    assert count(bare, FLOOR, 2) > count(slippery, FLOOR, 2)
+    assert (slippery != grippy).any()
+
+
+def test_the_close_up_can_be_left_out() -> None:
+    with_it, without = draw(make_scene()), draw(make_scene(), close_up=None)
+    corner = slice(450, 700), slice(20, 180)
+    assert with_it[corner].std() > 3 * without[corner].std()
+
+
+def test_colours_differ() -> None:
+    for robots in (1, 3, 7, 8, 20):
+        assert len(set(robot_colours(robots))) == robots
+        assert ALARM not in robot_colours(robots)
+
+
+def test_round_lengths() -> None:
+    assert [round_length(least) for least in (0.9, 1.0, 1.1, 3.0, 70.0, 600.0)] == pytest.approx(
+        [1.0, 1.0, 2.0, 5.0, 100.0, 1000.0]
+    )
+
+
+def test_impossible_options_are_refused() -> None:
+    with pytest.raises(ValueError, match="mode 'video' is not one of rgb_array, human"):
+        make_renderer(mode="video")
+    with pytest.raises(ValueError, match=r"size_px \(960, 10\) must be at least 64"):
+        make_renderer(size_px=(960, 10))
+
+
+def test_without_pygame_the_error_says_what_to_install(monkeypatch: pytest.MonkeyPatch) -> None:
+    real_import = builtins.__import__
+
+    def no_pygame(name: str, *arguments: Any, **options: Any) -> Any:
+        if name.split(".")[0] == "pygame":
+            raise ImportError(name)
+        return real_import(name, *arguments, **options)
+
+    monkeypatch.setattr(builtins, "__import__", no_pygame)
+    with pytest.raises(ImportError, match=r"pip install 'tlf-env\[view\]'"):
+        make_renderer()
+
+
+def test_closing_twice_is_fine_and_drawing_then_does_nothing() -> None:
+    renderer = make_renderer()
+    frame(renderer, make_scene())
+    renderer.close()
+    renderer.close()
+    assert renderer.draw(make_scene()) is None
+
+
+@pytest.fixture
+def window(monkeypatch: pytest.MonkeyPatch) -> Iterator[Renderer]:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame.display.quit()
+    renderer = make_renderer(mode="human", fps=1000.0)
+    yield renderer
+    renderer.close()
+    assert not pygame.display.get_init()
+
+
+def test_a_window_shows_what_an_array_holds(window: Renderer) -> None:
+    assert window.draw(make_scene()) is None
+    shown = pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+    assert np.array_equal(shown, draw(make_scene()))
+
+
+def test_closing_the_window_quietly_stops_drawing(window: Renderer) -> None:
+    window.draw(make_scene())
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    for k in range(3):
+        assert window.draw(make_scene(t_s=0.1 * k)) is None
+    assert not pygame.display.get_init()
+    window.close()
+
+
+def test_the_picture_follows_the_window_in_size(window: Renderer) -> None:
+    window.draw(make_scene())
+    pygame.display.set_mode((500, 400), pygame.RESIZABLE)
+    window.draw(make_scene(t_s=0.1))
+    window.draw(make_scene(t_s=0.2))
+    surface = pygame.display.get_surface()
+    assert surface.get_size() == (500, 400)
+    assert pygame.surfarray.array3d(surface)[:, -100:].std() > 0
+
+
+def test_a_window_keeps_to_its_frame_rate(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    renderer = make_renderer(mode="human", fps=20.0, size_px=(64, 64))
+    renderer.draw(make_scene())
+    begin = time.perf_counter()
+    for k in range(4):
+        renderer.draw(make_scene(t_s=0.05 * k))
+    assert time.perf_counter() - begin > 0.15
+    renderer.close()
+
+
+@pytest.mark.parametrize("robots", [1, 3])
+def test_the_scene_of_a_formation_is_its_truth(robots: int) -> None:
+    from tlf_env import parallel_env
+    from tlf_env.envs.rendering import scene_of
+
+    env = parallel_env("infinity", robots=robots, control_period_s=0.05, time_gap_s=1.0)
+    env.reset(seed=1)
+    start = scene_of(env.formation)
+    kept = Scene(*(np.array(field) for field in start))
+    assert np.isnan(start.ghost_x_mm).all()
+    past = []
+    for _ in range(30):
+        past.append(scene_of(env.formation))
+        env.step({agent: np.array([0.3, 0.0]) for agent in env.agents})
+    scene, gap_ago = scene_of(env.formation), past[10]
+    for field, before in zip(start, kept, strict=True):
+        assert np.array_equal(field, before, equal_nan=True)
+    assert scene.t_s == pytest.approx(1.5)
+    state = env.formation.state()
+    assert np.array_equal(scene.x_mm, state[:, 0])
+    assert np.allclose(np.sin(scene.theta_rad), state[:, 2])
+    assert all(np.shape(field) == (robots,) for field in scene[1:])
+    assert (scene.wheel_angle_l_rad > 0).all()
+    assert np.isnan(scene.ghost_x_mm[0])
+    assert np.allclose(scene.ghost_x_mm[1:], gap_ago.x_mm[:-1])
+    assert np.allclose(scene.ghost_y_mm[1:], gap_ago.y_mm[:-1])
+    assert np.allclose(scene.ghost_theta_rad[1:], gap_ago.theta_rad[:-1], atol=0.02)
+    error = np.hypot(scene.reference_x_mm - scene.x_mm, scene.reference_y_mm - scene.y_mm)
+    assert np.allclose(scene.position_error_mm, error)
+    assert draw(scene, size_px=(160, 120)).std() > 0
+
+
+def test_a_ghost_that_stood_still_heads_as_its_robot_does() -> None:
+    from tlf_env import parallel_env
+    from tlf_env.envs.rendering import scene_of
+
+    env = parallel_env("infinity", control_period_s=0.05, time_gap_s=1.0, disturbance="none")
+    env.reset(seed=1)
+    for _ in range(22):
+        env.step({agent: np.zeros(2) for agent in env.agents})
+    scene = scene_of(env.formation)
+    assert np.allclose(scene.ghost_theta_rad[1:], scene.theta_rad[:-1], atol=1e-6)
