@@ -19,12 +19,13 @@ from scipy.stats import binomtest, trim_mean
 
 from baselines.bench import Results
 from tlf_env.numerics.files import atomic
+from tlf_env.task.channels import CHANNELS
 
 REPEATS = 2000
 LEVEL = 0.95
 BOOTSTRAP_SEED = 20_000
 PROFILE_SCORES = np.linspace(0, 100, 101)
-REFERENCE = "reference:consistent"
+REFERENCES = ("reference:consistent", "reference")  # the same policy
 LOSSES = (0.05, 0.5)
 
 Stratum = tuple[str, str, float | None]  # task, disturbance, value of the swept knob
@@ -65,10 +66,18 @@ def rate(events: int, runs: int) -> dict[str, Any]:
     }
 
 
-def worst(line: dict[str, Any], metric: str) -> float:
-    """A run's value of a metric at its worst robot; infinite if undefined for all."""
+def worst(line: dict[str, Any], metric: str) -> float | None:
+    """A run's value of a metric at its worst robot; None if undefined for all."""
     values = [robot[metric] for robot in line["robots"] if robot[metric] is not None]
-    return float(max(values, default=math.inf))
+    return max(values, default=None)
+
+
+def median(values: Sequence[float | None]) -> dict[str, Any]:
+    """Median of what is defined, with its interval; None if nothing is."""
+    defined = np.array([value for value in values if value is not None])
+    if not defined.size:
+        return {"median": None, "interval": None}
+    return {"median": _median(defined), "interval": interval(defined, _median)}
 
 
 def run_score(line: dict[str, Any]) -> float:
@@ -96,8 +105,7 @@ def cell_table(lines: list[dict[str, Any]]) -> dict[str, Any]:
         "error_capped_mean_mm",
         "torque_rms_Nmm",
     ):
-        values = np.array([worst(line, metric) for line in lines])
-        table[metric] = {"median": float(np.median(values)), "interval": interval(values, _median)}
+        table[metric] = median([worst(line, metric) for line in lines])
     scores = np.array([run_score(line) for line in lines])
     table["score"] = {
         "iqm": interquartile_mean(scores),
@@ -124,7 +132,7 @@ def leaderboard(results: Results) -> dict[str, Any]:
     groups: dict[str, dict[Stratum, list[dict[str, Any]]]] = {}
     for line in results.ordered():
         groups.setdefault(line["policy"], {}).setdefault(stratum_of(line), []).append(line)
-    reference = REFERENCE if REFERENCE in groups else next(iter(groups), None)
+    reference = next((name for name in (*REFERENCES, *groups) if name in groups), None)
     cells = [
         {
             "policy": policy,
@@ -204,9 +212,14 @@ def profile(strata: dict[Stratum, list[dict[str, Any]]]) -> list[float]:
 
 
 def breaking_points(results: Results, cells: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Where along a sweep a policy loses 5 % and 50 % of its runs, interpolated; None if it does not."""
+    """Where along a sweep a policy loses 5 % and 50 % of its runs, interpolated; None if it does not.
+
+    A sweep is walked from the value nearest to the knob's nominal one outwards.
+    """
     if results.plan.sweep is None:
         return []
+    nominals = {channel.path: channel.nominal for channel in CHANNELS}
+    nominal = nominals.get(results.plan.sweep, 0.0)
     out = []
     for policy in results.plan.policies:
         for task in results.plan.tasks:
@@ -217,7 +230,7 @@ def breaking_points(results: Results, cells: list[dict[str, Any]]) -> list[dict[
                     if (cell["policy"], cell["task"], cell["disturbance"])
                     == (policy, task, disturbance)
                 ]
-                mine.sort(key=lambda cell: cell["sweep"])
+                mine.sort(key=lambda cell: abs(cell["sweep"] - nominal))
                 failed = [1 - cell["success"]["share"] for cell in mine]
                 values = [cell["sweep"] for cell in mine]
                 row: dict[str, Any] = {"policy": policy, "task": task, "disturbance": disturbance}
@@ -303,7 +316,7 @@ def task_tables(board: dict[str, Any], task: str) -> list[str]:
             continue
         knob = "" if cell["sweep"] is None else f" = {cell['sweep']:g}"
         figures = [
-            f"{cell[metric]['median']:.{digits}f} {span(cell[metric]['interval'], digits)}"
+            f"{number(cell[metric]['median'], digits)} {span(cell[metric]['interval'], digits)}"
             for metric, digits in (
                 ("position_rmse_mm", 1),
                 ("settled_formation_rmse_mm", 1),
@@ -313,7 +326,7 @@ def task_tables(board: dict[str, Any], task: str) -> list[str]:
         parts.append(
             f"| {cell['disturbance']}{knob} | {title(cell)} | {cell['lost']['count']} of {cell['runs']} "
             f"{span([100 * x for x in cell['lost']['interval']], 0)} % | {cell['touched']['count']} | "
-            f"{' | '.join(figures)} | {cell['torque_rms_Nmm']['median']:.1f} | "
+            f"{' | '.join(figures)} | {number(cell['torque_rms_Nmm']['median'], 1)} | "
             f"{cell['score']['iqm']:.1f} {span(cell['score']['interval'], 1)} |"
         )
     return [*parts, ""]

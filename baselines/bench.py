@@ -9,18 +9,22 @@ an interruption changes them.
 from __future__ import annotations
 
 import hashlib
+import inspect
 import json
 import os
 import subprocess
+import threading
 from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass
-from multiprocessing import get_context
+from importlib.util import find_spec
+from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.policies import make_policy
-from baselines.run import run_policy, versions
+from baselines.run import Policy, run_policy, versions
+from tlf_env.envs.parallel import checked_seed
 from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.files import atomic
 from tlf_env.task.scenario import Scenario, load_scenario, preset_names, presets_folder
@@ -55,15 +59,19 @@ class Plan:
     overrides: tuple[tuple[str, Any], ...] = ()
     trust: bool = False
 
+    @property
+    def values(self) -> tuple[float | None, ...]:
+        """Values of the swept knob; only None without a sweep."""
+        return self.sweep_values if self.sweep else (None,)
+
     def cells(self) -> list[Cell]:
         """All episodes in the order of the tables; seeds run slowest, so that early results cover all."""
-        values: tuple[float | None, ...] = self.sweep_values if self.sweep else (None,)
         return [
             Cell(policy, task, disturbance, self.level, value, seed)
             for seed in range(*self.seeds)
             for task in self.tasks
             for disturbance in self.disturbances
-            for value in values
+            for value in self.values
             for policy in self.policies
         ]
 
@@ -177,26 +185,47 @@ def git_revision() -> str | None:
     return revision + ("+" if changes.strip() else "")
 
 
+def policy_hash(name: str, policy: Policy) -> str | None:
+    """Twelve digits of the file that a policy comes from; None if there is none."""
+    try:
+        source = name if name.endswith(".zip") else inspect.getsourcefile(type(policy))
+    except TypeError:
+        source = None
+    return hashlib.sha256(Path(source).read_bytes()).hexdigest()[:12] if source else None
+
+
 def plan_record(plan: Plan) -> dict[str, Any]:
-    """What ``plan.json`` holds."""
-    hashes = {
-        f"{task}, {disturbance}": scenario_hash(
-            plan.scenario(Cell("", task, disturbance, plan.level, _first(plan.sweep_values), 0))
-        )
-        for task in plan.tasks
-        for disturbance in plan.disturbances
-    }
+    """What ``plan.json`` holds. Every scenario is loaded and every policy made on the way.
+
+    Raises
+    ------
+    ValueError
+        for an unknown name, a knob out of its range, a seed too large, or a policy that does not fit.
+    """
+    checked_seed(plan.seeds[1] - 1)
+    scenarios: dict[str, str] = {}
+    policies: dict[str, str | None] = {}
+    for task in plan.tasks:
+        for disturbance in plan.disturbances:
+            for value in plan.values:
+                cell = Cell("", task, disturbance, plan.level, value, plan.seeds[0])
+                place = ", ".join(
+                    (task, disturbance) if value is None else (task, disturbance, f"{value:g}")
+                )
+                scenario = plan.scenario(cell)
+                scenarios[place] = scenario_hash(scenario)
+        for name in plan.policies:
+            policies[name] = policy_hash(name, make_policy(name, scenario, trust=plan.trust))
+    asked = asdict(plan)
+    del asked["trust"]  # a permission, which changes no result
     return {
-        "plan": json.loads(json.dumps(asdict(plan))),
-        "scenarios": hashes,
+        "plan": json.loads(json.dumps(asked)),
+        "policies": policies,
+        "scenarios": scenarios,
         "sources": sources_digest(),
         "versions": versions(),
         "git_revision": git_revision(),
     }
-
-
-def _first(values: tuple[float, ...]) -> float | None:
-    return values[0] if values else None
 
 
 class Results:
@@ -205,17 +234,18 @@ class Results:
     Raises
     ------
     ValueError
-        if the folder holds results of another plan, or of other sources of the simulation.
+        if the plan cannot run, or the folder holds results of another plan, of other policies or of
+        other sources of the simulation.
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
         self.folder, self.plan = folder, plan
-        folder.mkdir(parents=True, exist_ok=True)
         record = plan_record(plan)
+        folder.mkdir(parents=True, exist_ok=True)
         path = folder / PLAN
         if path.exists():
             before = json.loads(path.read_text(encoding="utf-8"))
-            for key in ("plan", "scenarios", "sources"):
+            for key in ("plan", "policies", "scenarios", "sources"):
                 if before.get(key) != record[key]:
                     raise ValueError(
                         f"{folder} holds results of another {key}; take another --out, or remove it"
@@ -237,9 +267,12 @@ class Results:
             with atomic(path, "wb") as file:
                 file.write(whole)
         lines: dict[Cell, dict[str, Any]] = {}
-        for text in whole.splitlines():
-            line = json.loads(text)
-            lines[Cell(*(line[name] for name in Cell._fields))] = line
+        for number, text in enumerate(whole.splitlines(), start=1):
+            try:
+                line = json.loads(text)
+                lines[Cell(*(line[name] for name in Cell._fields))] = line
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(f"{path}, line {number} is damaged; remove it") from error
         return lines
 
     def add(self, line: dict[str, Any]) -> None:
@@ -279,16 +312,8 @@ def run_bench(
     """
     if processes < 1:
         raise ValueError(f"processes {processes} must be at least 1")
-    for policy in plan.policies:
-        for task in plan.tasks:
-            cell = Cell(
-                policy, task, plan.disturbances[0], plan.level, _first(plan.sweep_values), 0
-            )
-            make_policy(policy, plan.scenario(cell), trust=plan.trust)
-    for value in plan.sweep_values[-1:]:
-        plan.scenario(
-            Cell("", plan.tasks[0], plan.disturbances[0], plan.level, value, plan.seeds[0])
-        )
+    if find_spec("arch") is None:
+        raise ValueError("the tables need arch (pip install 'tlf-env[bench]')")
     results = Results(folder, plan)
     todo = results.missing()
     total = len(plan.cells())
@@ -311,7 +336,9 @@ def run_bench(
 def _in_processes(plan: Plan, cells: list[Cell], processes: int) -> Iterator[dict[str, Any]]:
     """Results as they come; only a few episodes are handed out ahead, so that an interrupt is quick."""
     waiting = iter(cells)
-    pool = ProcessPoolExecutor(processes, mp_context=get_context("spawn"))
+    pool = ProcessPoolExecutor(
+        processes, mp_context=get_context("spawn"), initializer=_end_with_parent
+    )
     running: set[Future[dict[str, Any]]] = set()
     try:
         while True:
@@ -327,6 +354,18 @@ def _in_processes(plan: Plan, cells: list[Cell], processes: int) -> Iterator[dic
                 yield future.result()
     finally:
         pool.shutdown(wait=True, cancel_futures=True)
+
+
+def _end_with_parent() -> None:
+    """Let this worker end when its parent is killed, which a pool by itself does not."""
+    parent = parent_process()
+
+    def wait_and_leave() -> None:
+        if parent is not None:
+            parent.join()
+            os._exit(1)
+
+    threading.Thread(target=wait_and_leave, daemon=True).start()
 
 
 def _on_ray(plan: Plan, cells: list[Cell], address: str) -> Iterator[dict[str, Any]]:

@@ -23,7 +23,7 @@ from tlf_env.onboard.tracking import (
 from tlf_env.physics.kinematics import follow_wheels
 from tlf_env.physics.parameters import RobotParameters, body
 from tlf_env.physics.state import Motion, axle_midpoint
-from tlf_env.task.drivers import TWIST, WHEEL_SPEED, wheel_command
+from tlf_env.task.actions import TWIST, WHEEL_SPEED, wheel_command
 
 PRESETS = ("consistent", "printed")
 BODY = body(RobotParameters())

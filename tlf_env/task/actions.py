@@ -78,3 +78,11 @@ def reference_action(
 def wheel_speeds(forward: float, turn: float, body: Body) -> tuple[float, float]:
     """Wheel speeds (left, right; rad/s) of a twist (mm/s, rad/s): the inverse of eq. (1)."""
     return (forward - turn * body.h) / body.R, (forward + turn * body.h) / body.R
+
+
+@law
+def wheel_command(a_0: float, a_1: float, kind: int, body: Body) -> tuple[float, float]:
+    """Wheel speeds (left, right; rad/s) that a ``twist`` or ``wheel_speed`` action asks for."""
+    if kind == WHEEL_SPEED:
+        return a_0 * FULL_WHEEL_SPEED_RAD_S, a_1 * FULL_WHEEL_SPEED_RAD_S
+    return wheel_speeds(a_0 * FULL_SPEED_MM_S, a_1 * FULL_YAW_RATE_RAD_S, body)

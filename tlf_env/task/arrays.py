@@ -201,9 +201,7 @@ write_sample = writer(Sample)
 
 
 def _constant(row: tuple[float, ...], robots: int, lanes: int) -> np.ndarray:
-    return np.ascontiguousarray(
-        np.broadcast_to(np.array(row, dtype=np.float64)[:, None, None], (len(row), robots, lanes))
-    )
+    return np.tile(np.array(row, dtype=np.float64)[:, None, None], (1, robots, lanes))
 
 
 def longest(scenario: Scenario, channel: int) -> float:

@@ -64,12 +64,11 @@ from tlf_env.task.actions import (
     FULL_RESIDUAL_RAD_S,
     FULL_SPEED_MM_S,
     FULL_TORQUE_NMM,
-    FULL_WHEEL_SPEED_RAD_S,
     FULL_YAW_RATE_RAD_S,
     RESIDUAL,
     TORQUE,
-    WHEEL_SPEED,
     reference_action,
+    wheel_command,
     wheel_speeds,
 )
 from tlf_env.task.arrays import (
@@ -151,8 +150,6 @@ def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
     if kind == TORQUE:
         full = FULL_TORQUE_NMM * MILLINEWTON_PER_NEWTON
         return a_0 * full, a_1 * full
-    if kind == WHEEL_SPEED:
-        return a_0 * FULL_WHEEL_SPEED_RAD_S, a_1 * FULL_WHEEL_SPEED_RAD_S
     body = read_body(a.bodies, r, lane)
     if kind == RESIDUAL:
         base = a.base_actions[lane, r]
@@ -162,7 +159,7 @@ def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
             base[1] * FULL_YAW_RATE_RAD_S + a_1 * FULL_RESIDUAL_RAD_S,
             body,
         )
-    return wheel_speeds(a_0 * FULL_SPEED_MM_S, a_1 * FULL_YAW_RATE_RAD_S, body)
+    return wheel_command(a_0, a_1, kind, body)
 
 
 @law
