@@ -391,9 +391,10 @@ class Renderer:
         """The view of path and start: in the middle, or farther right, clear of the text."""
         room = MARGIN_RADII * max(robot.outline_radius_mm for robot in self._robots)
         low, high = self._path_mm.min(axis=0), self._path_mm.max(axis=0)
-        start = np.clip(self._start_mm, low - MOST_START_MM, high + MOST_START_MM)
-        low = np.minimum(low, start.min(axis=0)) - room
-        high = np.maximum(high, start.max(axis=0)) + room
+        start = self._start_mm[np.isfinite(self._start_mm).all(axis=-1)]
+        start = np.clip(start, low - MOST_START_MM, high + MOST_START_MM)
+        shown = np.concatenate([self._path_mm, start])
+        low, high = shown.min(axis=0) - room, shown.max(axis=0) + room
         width, height = self._canvas.get_size()
         scale = min(width / (high[0] - low[0]), height / (high[1] - low[1]))
         pen = OVERSAMPLING * self._unit
