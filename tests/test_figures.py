@@ -173,7 +173,7 @@ def test_texts_stay_clear_of_the_axes_and_of_each_other(kind: str, name: str) ->
     run = record(kind.split()[0])
     if kind.endswith("lost"):  # the longest names
         columns = {**run.columns, "position_error_mm": 1000 + run["position_error_mm"]}
-        run = replace(run, columns=columns, lost=np.ones(run.robots, dtype=bool))
+        run = replace(run, columns=columns, lost_at_s=np.full(run.robots, 1.0))
     figure = drawn(figures.FIGURES[name](run))
     whole = figure.bbox
     panels = [axes.get_window_extent() for axes in figure.axes]
@@ -276,7 +276,7 @@ def test_thinning_keeps_the_ends_and_the_extremes(count: int) -> None:
 
 @pytest.mark.parametrize("n", range(1, 21))
 def test_colours_and_markers_tell_robots_apart(n: int) -> None:
-    run = replace(record("1"), lost=np.zeros(n, dtype=bool))
+    run = replace(record("1"), lost_at_s=np.full(n, np.inf))
     colours = {tuple(figures.to_rgb(figures._colour(run, i))) for i in range(n)}
     assert len(colours) == n
     assert all(np.dot(c, (0.2126, 0.7152, 0.0722)) < 0.85 for c in colours)  # none lost on white
@@ -286,7 +286,7 @@ def test_very_many_robots_get_a_spread_of_rows() -> None:
     run = record("10")
     assert len(figures.slip(run).axes) == 10
     many = {name: np.tile(column, (1, 40)) for name, column in run.columns.items()}
-    crowd = replace(run, columns=many, lost=np.tile(run.lost, 40), touched=np.tile(run.touched, 40))
+    crowd = replace(run, columns=many, lost_at_s=np.tile(run.lost_at_s, 40), touched_at_s=np.tile(run.touched_at_s, 40))
     rows = figures.slip(crowd).axes
     assert len(rows) == figures.MOST_SHOWN
     assert rows[0].get_ylabel().startswith("robot 0\n")

@@ -30,19 +30,20 @@ class PymunkPlant:
     def __init__(self, robots: list[RobotParameters]) -> None:
         self.reset(body_array(robots)[:, :, 0])
 
-    def reset(self, constants: np.ndarray) -> None:
-        """Rebuild the space for bodies with the kernel's ``constants`` (field, robot); contacts are forgotten.
+    def reset(self, constants: np.ndarray | None = None) -> None:
+        """Rebuild the space; contacts are forgotten, and a run repeats bit for bit.
 
-        A rebuilt space repeats a run bit for bit.
+        ``constants`` (field, robot) are the kernel's of the bodies, the last ones if None.
         """
-        self._constants = constants.copy()
+        if constants is not None:
+            self._constants = constants.copy()
         space = pymunk.Space()
         space.iterations = ITERATIONS
         space.collision_slop = COLLISION_SLOP_MM
         space.damping = 1.0
         space.gravity = (0.0, 0.0)
         self._bodies: list[pymunk.Body] = []
-        for row in constants.T.tolist():
+        for row in self._constants.T.tolist():
             robot = Body(*row)
             body = pymunk.Body(robot.m, robot.I)
             outline = pymunk.Circle(body, robot.outline_radius, offset=(0.0, robot.outline_ahead))
