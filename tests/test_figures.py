@@ -286,7 +286,12 @@ def test_very_many_robots_get_a_spread_of_rows() -> None:
     run = record("10")
     assert len(figures.slip(run).axes) == 10
     many = {name: np.tile(column, (1, 40)) for name, column in run.columns.items()}
-    crowd = replace(run, columns=many, lost_at_s=np.tile(run.lost_at_s, 40), touched_at_s=np.tile(run.touched_at_s, 40))
+    crowd = replace(
+        run,
+        columns=many,
+        lost_at_s=np.tile(run.lost_at_s, 40),
+        touched_at_s=np.tile(run.touched_at_s, 40),
+    )
     rows = figures.slip(crowd).axes
     assert len(rows) == figures.MOST_SHOWN
     assert rows[0].get_ylabel().startswith("robot 0\n")

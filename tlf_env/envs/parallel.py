@@ -5,6 +5,7 @@ from __future__ import annotations
 import secrets
 import warnings
 from collections.abc import Callable, Mapping
+from numbers import Real
 from pathlib import Path
 from typing import Any
 
@@ -212,12 +213,18 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                 action = actions[agent]
             except KeyError:
                 self._complain(actions)
-            if np.shape(action) != (ACTION_SIZE,):
+            try:
+                shape = np.shape(action)
+                if shape == (ACTION_SIZE,):
+                    buffer[i] = action
+                    continue
+            except (TypeError, ValueError) as error:
                 raise ValueError(
-                    f"{agent}: the action must have the shape ({ACTION_SIZE},), "
-                    f"got {np.shape(action)}"
-                )
-            buffer[i] = action
+                    f"{agent}: the action must be {ACTION_SIZE} numbers, got {action!r}"
+                ) from error
+            raise ValueError(
+                f"{agent}: the action must have the shape ({ACTION_SIZE},), got {shape}"
+            )
 
     def _complain(self, actions: dict[Agent, np.ndarray]) -> None:
         unknown = [agent for agent in actions if agent not in self.agents]
@@ -326,7 +333,7 @@ def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | No
     if unknown:
         raise ValueError(f"reset option {unknown[0]!r} is unknown; there are poses, phase_s")
     phase_s = options.get("phase_s", 0.0)
-    if not isinstance(phase_s, int | float) or not np.isfinite(phase_s):
+    if not isinstance(phase_s, Real) or not np.isfinite(float(phase_s)):
         raise ValueError(
             f"reset option phase_s must be a finite number of seconds, got {phase_s!r}"
         )

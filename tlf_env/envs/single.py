@@ -12,10 +12,10 @@ import numpy as np
 from tlf_env.envs.parallel import RENDER_MODES, FormationParallelEnv
 from tlf_env.envs.spec import documented
 from tlf_env.onboard.parts import load_part
-from tlf_env.task.actions import ACTION_SIZE, RESIDUAL, TWIST
+from tlf_env.task.actions import ACTION_SIZE, REFERENCE, TWIST
 from tlf_env.task.scenario import Scenario
 
-REFERENCE = "reference"
+BY_REFERENCE = "reference"
 
 
 class Predicts(Protocol):
@@ -69,7 +69,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         scenario: str | Path | Mapping[str, Any] | Scenario = "infinity",
         *,
         learner: str | None = None,
-        others: str | Predicts = REFERENCE,
+        others: str | Predicts = BY_REFERENCE,
         render_mode: str | None = None,
         **overrides: Any,
     ) -> None:
@@ -87,7 +87,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._driver = self._make_driver(others)
         self._driver_state: Any = None
         kinds = self.formation_env.formation.arrays.kinds
-        kinds[self._rest] = RESIDUAL if self._driver is None else TWIST
+        kinds[self._rest] = REFERENCE if self._driver is None else TWIST
         self._driver_start = np.ones(len(self._rest), dtype=np.bool_)
         self._still = {
             agents[i]: np.zeros(ACTION_SIZE, self.action_space.dtype) for i in self._rest
@@ -95,17 +95,17 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @staticmethod
     def _make_driver(others: str | Predicts) -> Predicts | None:
-        if others == REFERENCE:
+        if others == BY_REFERENCE:
             return None
         driver: Any = others
         if isinstance(others, str):
             if ":" not in others:
                 raise ValueError(
-                    f"others {others!r} is neither {REFERENCE!r} nor 'module:factory' nor an object"
+                    f"others {others!r} is neither {BY_REFERENCE!r} nor 'module:factory' nor an object"
                 )
             driver = load_part(others)()
         if not hasattr(driver, "predict"):
-            raise ValueError(f"others {others!r} has no predict()")
+            raise ValueError(f"others {driver!r} has no predict()")
         return cast(Predicts, driver)
 
     @property
@@ -142,7 +142,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _drive(self) -> dict[str, np.ndarray]:
         if self._driver is None or not self._rest:
-            return dict(self._still)  # a residual of zero is the reference itself
+            return dict(self._still)  # the drivers put the reference's action in their place
         seen = self.formation_env.formation.arrays.observations[0, self._rest]
         actions, self._driver_state = self._driver.predict(
             seen, self._driver_state, self._driver_start.copy(), True

@@ -54,10 +54,21 @@ def cache_folder() -> Path:
         with tempfile.TemporaryFile(dir=folder):
             return folder
     except OSError:
-        user = os.getuid() if hasattr(os, "getuid") else "user"
-        folder = Path(tempfile.gettempdir()) / f"tlf_env-{user}" / sources_digest()
-        folder.mkdir(parents=True, exist_ok=True, mode=0o700)
+        folder = _temporary_folder() / sources_digest()
+        folder.mkdir(exist_ok=True)
         return folder
+
+
+def _temporary_folder() -> Path:
+    """A folder of this user alone below the system's temporary one: a cache holds code."""
+    user = os.getuid() if hasattr(os, "getuid") else "user"
+    folder = Path(tempfile.gettempdir()) / f"tlf_env-{user}"
+    folder.mkdir(mode=0o700, exist_ok=True)
+    status = folder.stat(follow_symlinks=False)
+    mine = not hasattr(os, "getuid") or (
+        status.st_uid == os.getuid() and not status.st_mode & 0o022
+    )
+    return folder if mine and not folder.is_symlink() else Path(tempfile.mkdtemp(prefix="tlf_env-"))
 
 
 def law(function: F) -> F:

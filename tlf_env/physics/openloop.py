@@ -5,11 +5,12 @@ from __future__ import annotations
 import itertools
 import json
 import math
+import re
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
-from pydantic import Field, FiniteFloat, TypeAdapter, ValidationError, model_validator
+from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
 from tlf_env.numerics.compiled import driver
 from tlf_env.numerics.errors import one_line
@@ -18,7 +19,6 @@ from tlf_env.physics.kernel import substep
 from tlf_env.physics.parameters import (
     MILLINEWTON_PER_NEWTON,
     Frozen,
-    Positive,
     RobotParameters,
     body_array,
 )
@@ -48,35 +48,42 @@ COLUMNS = (
     "omega_r_rad_s",
 )
 ROW_EVERY_S = 0.1
+MAX_DURATION_S = 1e5
+MAX_TORQUE_NMM = 1e6
+MAX_STEPS = 100_000_000
+NAME = re.compile(r"[\w][\w.+-]{0,99}")
+
+Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
+Torque = Annotated[Number, Field(ge=-MAX_TORQUE_NMM, le=MAX_TORQUE_NMM)]
 
 
 class OpenLoopStart(Frozen):
     """State of the axle's midpoint c, the castor and the wheels at t = 0."""
 
-    x_mm: FiniteFloat = 0.0
-    y_mm: FiniteFloat = 0.0
-    theta_rad: FiniteFloat = 0.0
-    castor_rad: FiniteFloat = 0.0
-    forward_mm_s: FiniteFloat = 0.0
-    right_mm_s: FiniteFloat = 0.0
-    yaw_rad_s: FiniteFloat = 0.0
-    omega_l_rad_s: FiniteFloat = 0.0
-    omega_r_rad_s: FiniteFloat = 0.0
-    castor_spin_rad_s: FiniteFloat = 0.0
+    x_mm: Number = 0.0
+    y_mm: Number = 0.0
+    theta_rad: Number = 0.0
+    castor_rad: Number = 0.0
+    forward_mm_s: Number = 0.0
+    right_mm_s: Number = 0.0
+    yaw_rad_s: Number = 0.0
+    omega_l_rad_s: Number = 0.0
+    omega_r_rad_s: Number = 0.0
+    castor_spin_rad_s: Number = 0.0
 
 
 class OpenLoopInput(Frozen):
     """Torques (N·mm) that hold from ``from_s`` on."""
 
-    from_s: Annotated[FiniteFloat, Field(ge=0)] = 0.0
-    torque_l_Nmm: FiniteFloat
-    torque_r_Nmm: FiniteFloat
+    from_s: Annotated[Number, Field(ge=0)] = 0.0
+    torque_l_Nmm: Torque
+    torque_r_Nmm: Torque
 
 
 class OpenLoopScenario(Frozen):
     """One open-loop run: duration, start, joint friction on or off, torques over time."""
 
-    duration_s: Positive
+    duration_s: Annotated[Number, Field(gt=0, le=MAX_DURATION_S)]
     start: OpenLoopStart = OpenLoopStart()
     joint_friction: bool = True
     inputs: tuple[OpenLoopInput, ...] = Field(min_length=1)
@@ -86,6 +93,12 @@ class OpenLoopScenario(Frozen):
         times = [one.from_s for one in self.inputs]
         if any(b <= a for a, b in itertools.pairwise(times)):
             raise ValueError(f"inputs: from_s must increase from one to the next, got {times}")
+        if not math.isclose(self.duration_s % ROW_EVERY_S, 0.0, abs_tol=1e-9) and not math.isclose(
+            self.duration_s % ROW_EVERY_S, ROW_EVERY_S, abs_tol=1e-9
+        ):
+            raise ValueError(
+                f"duration_s {self.duration_s} must be a multiple of {ROW_EVERY_S} s, the rows' distance"
+            )
         return self
 
 
@@ -168,18 +181,24 @@ def run_open_loop(
     Raises
     ------
     ValueError
-        if ``dt_s`` does not divide 0.1 s.
+        if ``dt_s`` is not positive, does not divide 0.1 s, or makes too many steps.
     """
     robot = (robot or RobotParameters()).model_copy(
         update={"joint_friction": scenario.joint_friction}
     )
+    if not (math.isfinite(dt_s) and dt_s > 0):
+        raise ValueError(f"dt_s {dt_s} must be above 0")
+    if scenario.duration_s / dt_s > MAX_STEPS:
+        raise ValueError(
+            f"dt_s {dt_s} makes more than {MAX_STEPS} steps of {scenario.duration_s} s"
+        )
     per_row = round(ROW_EVERY_S / dt_s)
     if per_row < 1 or abs(per_row * dt_s - ROW_EVERY_S) > 1e-9:
         raise ValueError(f"dt_s {dt_s} must divide the {ROW_EVERY_S} s between rows")
     bodies = body_array([robot])
     motions, contacts = initial_rows(scenario.start, robot.com_offset_mm)
     steps = round(scenario.duration_s / dt_s)
-    starts = np.array([round(one.from_s / dt_s) for one in scenario.inputs])
+    starts = np.array([math.ceil(one.from_s / dt_s - 1e-6) for one in scenario.inputs])
     levels = np.array([(one.torque_l_Nmm, one.torque_r_Nmm) for one in scenario.inputs])
     held = np.searchsorted(starts, np.arange(steps), side="right") - 1
     torques = np.where(held[:, None] >= 0, levels[held], 0.0) * MILLINEWTON_PER_NEWTON
@@ -205,14 +224,14 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
         data: Any = json.loads(path.read_text(encoding="utf-8"))
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
-    except (json.JSONDecodeError, UnicodeDecodeError) as error:
+    except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
     if not isinstance(data, dict) or not data:
         raise ValueError(
             f"{path} must hold an object of named scenarios, got {type(data).__name__}"
         )
     for name in data:
-        if not name or Path(name).name != name or name.startswith("."):
+        if not NAME.fullmatch(name):
             raise ValueError(f"{path}: the scenario name {name!r} cannot be a file name")
     try:
         return TypeAdapter(dict[str, OpenLoopScenario]).validate_python(data)

@@ -16,7 +16,7 @@ from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Floor, Rates
 
 SWEEP_TOLERANCE_MM_S = 1e-9
-SWEEP_CAP = 64
+SWEEP_CAP = 1000  # a sticking castor at an angle can need hundreds; most substeps need few
 
 
 @law

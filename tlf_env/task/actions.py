@@ -11,6 +11,7 @@ from tlf_env.task.observation import Entry, Tracking
 
 ACTION_SIZE = 2
 TWIST, WHEEL_SPEED, TORQUE, RESIDUAL = range(4)
+REFERENCE = 5  # no action of its own: the reference's twist takes its place
 ACTION_KINDS = {
     "twist": TWIST,
     "wheel_speed": WHEEL_SPEED,

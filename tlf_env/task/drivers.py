@@ -65,6 +65,7 @@ from tlf_env.task.actions import (
     FULL_SPEED_MM_S,
     FULL_TORQUE_NMM,
     FULL_YAW_RATE_RAD_S,
+    REFERENCE,
     RESIDUAL,
     TORQUE,
     reference_action,
@@ -344,6 +345,10 @@ def take_actions(a: Arrays, s: Settings) -> int:
                 return lane * robots + r
     for lane in range(lanes):
         for r in range(robots):
+            if a.kinds[r, lane] == REFERENCE:
+                base = a.base_actions[lane, r]
+                base[0], base[1] = reference_action(a.observations[lane, r], a.scales, s.base)
+                a.actions[lane, r, 0], a.actions[lane, r, 1] = base[0], base[1]
             a_0 = min(max(a.actions[lane, r, 0], -1.0), 1.0)
             a_1 = min(max(a.actions[lane, r, 1], -1.0), 1.0)
             clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]

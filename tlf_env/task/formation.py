@@ -119,6 +119,8 @@ class Formation:
         drivers.begin(a, 0, self._settings)
         self._parts.reset(a, self._settings)
         drivers.look(a, self._settings)
+        for flags in (a.lost, a.lost_now):  # who starts lost is lost in the first step
+            flags[:] = False
 
     def _load(self) -> None:
         """Put the payloads on."""
