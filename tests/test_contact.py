@@ -25,6 +25,7 @@ ON_ICE = RobotParameters(
 X, Y, THETA, V_X, V_Y, YAW, OMEGA_L = (
     Motion._fields.index(name) for name in ("x", "y", "theta", "v_x", "v_y", "w", "omega_l")
 )
+POSE, TWIST = [X, Y, THETA], [V_X, V_Y, YAW]
 PHASES_MM = np.arange(0, 0.6, 0.05)
 
 
@@ -129,11 +130,10 @@ def test_collision_conserves_momentum_where_the_floor_gives_none(aside_mm):
     assert np.diff(made.energy.ravel()).max() <= 1e-12 * made.energy[0, 0]
 
 
-def by_chipmunk_alone(starts: list[Motion], steps: int) -> np.ndarray:
-    """x, y, angle of frictionless robots in a space of pymunk's own, (step, 3, robot)."""
+def chipmunk_alone(starts: list[Motion]) -> pymunk.Space:
+    """Frictionless robots in a space of the test's own."""
     space = pymunk.Space()
     space.iterations, space.collision_slop = ITERATIONS, COLLISION_SLOP_MM
-    bodies = []
     for start in starts:
         one = pymunk.Body(ROBOT.mass_kg, ROBOT.body_inertia_kg_mm2)
         outline = pymunk.Circle(one, ROBOT.outline_radius_mm, offset=(0.0, AHEAD_MM))
@@ -141,12 +141,17 @@ def by_chipmunk_alone(starts: list[Motion], steps: int) -> np.ndarray:
         space.add(one, outline)
         one.angle, one.position = start.theta, (start.x, start.y)
         one.velocity, one.angular_velocity = (start.v_x, start.v_y), start.w
-        bodies.append(one)
-    rows = np.empty((steps, 3, len(starts)))
-    for k in range(steps):
-        space.step(DT_S)
-        rows[k] = np.transpose([(*one.position, one.angle) for one in bodies])
-    return rows
+    return space
+
+
+def space_poses(space: pymunk.Space) -> np.ndarray:
+    return np.transpose([(*one.position, one.angle) for one in space.bodies])
+
+
+def collide_once(plant: PymunkPlant, motions: np.ndarray) -> None:
+    before = motions.copy()
+    motions[POSE] += motions[TWIST] * DT_S
+    plant.collide(before, motions, DT_S)
 
 
 @pytest.mark.parametrize("seed", range(8))
@@ -158,16 +163,28 @@ def test_without_the_floor_robots_collide_exactly_as_chipmunk_has_it(seed):
             [-130, 130, 0], [0, 10, 230], rng.uniform(-3, 3, 3), rng.uniform(-2, 2, 3), strict=True
         )
     ]
-    steps = 800
-    wanted = by_chipmunk_alone(starts, steps)
-    plant = PymunkPlant([ROBOT] * 3)
+    space, plant = chipmunk_alone(starts), PymunkPlant([ROBOT] * 3)
     motions = np.array(starts).T[:, :, None].copy()
-    for k in range(steps):
-        before = motions.copy()
-        motions[[X, Y, THETA]] += motions[[V_X, V_Y, YAW]] * DT_S
-        plant.collide(before, motions, DT_S)
-        assert np.array_equal(motions[[X, Y, THETA], :, 0], wanted[k]), k
+    for _ in range(800):
+        space.step(DT_S)
+        collide_once(plant, motions)
+        assert np.array_equal(motions[POSE, :, 0], space_poses(space))
     assert not np.allclose(motions[V_X, :, 0], [start.v_x for start in starts])
+
+
+def test_robots_that_part_are_still_pushed_out_of_their_last_overlap():
+    """Chipmunk corrects an overlap in the substep after the one that saw it."""
+    half = OUTLINES_MM / 2 - 0.2
+    starts = [STILL._replace(x=-half), STILL._replace(x=half)]
+    space, plant = chipmunk_alone(starts), PymunkPlant([ROBOT] * 2)
+    motions = np.array(starts).T[:, :, None].copy()
+    for speed in (0.0, 500.0, 500.0):
+        for one, direction in zip(space.bodies, (-1, 1), strict=True):
+            one.velocity = direction * speed, 0.0
+        motions[V_X, :, 0] = -speed, speed
+        space.step(DT_S)
+        collide_once(plant, motions)
+        assert np.array_equal(motions[POSE, :, 0], space_poses(space))
 
 
 def test_a_rebuilt_space_repeats_a_collision_bit_for_bit():
@@ -182,9 +199,7 @@ def test_a_reset_plant_has_forgotten_its_contacts():
         plant.reset()
         motions = np.array(head_on(0.2)).T[:, :, None].copy()
         for _ in range(5):
-            before = motions.copy()
-            motions[[X, Y]] += motions[[V_X, V_Y]] * DT_S
-            plant.collide(before, motions, DT_S)
+            collide_once(plant, motions)
         results.append(motions)
     assert np.array_equal(*results)
 
@@ -196,7 +211,7 @@ def test_the_space_leaves_robots_that_do_not_touch_alone():
     motions[X] = [[-5000.0], [0.0], [5000.0]]
     for _ in range(100):
         before = motions.copy()
-        motions[[X, Y, THETA]] += motions[[V_X, V_Y, YAW]] * DT_S
+        motions[POSE] += motions[TWIST] * DT_S
         kernel = motions.copy()
         plant.collide(before, motions, DT_S)
         assert np.array_equal(motions, kernel)
