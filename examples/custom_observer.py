@@ -55,11 +55,7 @@ def main(horizon_s: float = 100.0, seed: int = 0) -> None:
         scenario = load_scenario("infinity", observer=observer, horizon_s=horizon_s)
         robots = run_policy(scenario, ReferencePolicy(), seed).metrics()
         errors = [f"{robot.position_rmse_mm:.2f}" for robot in robots]
-        formation = [f"{robot.formation_rmse_mm:.1f}" for robot in robots]
-        print(
-            f"{name:10s}: {', '.join(errors)} mm RMS to the own reference, "
-            f"{', '.join(formation)} mm to the place in the formation"
-        )
+        print(f"{name:10s}: position error {', '.join(errors)} mm RMS")
 
 
 if __name__ == "__main__":

@@ -1,0 +1,157 @@
+"""Every example runs, says how to start it, and prints what it promises."""
+
+from __future__ import annotations
+
+import importlib
+import inspect
+import subprocess
+import sys
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+import tlf_env
+from baselines import ReferencePolicy
+from tlf_env.envs.single import FormationEnv
+
+EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
+SCRIPTS = sorted(path.stem for path in EXAMPLES.glob("*.py"))
+FILES = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
+NEEDS = {"linear_design": "control", "train_ppo": "stable_baselines3"}
+
+every_script = pytest.mark.parametrize("name", SCRIPTS)
+
+
+@pytest.fixture
+def example(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
+    """The script ``name``, imported as from its own folder."""
+    pytest.importorskip(NEEDS.get(name, "tlf_env"))
+    monkeypatch.syspath_prepend(EXAMPLES)
+    return importlib.import_module(name)
+
+
+def test_there_is_something_to_run() -> None:
+    assert len(SCRIPTS) == 8
+    assert FILES == ["mixed_formation", "own_robot"]
+
+
+@every_script
+def test_every_script_says_what_it_shows_and_how_to_start_it(
+    example: ModuleType, name: str
+) -> None:
+    said = inspect.getdoc(example) or ""
+    assert f"    python examples/{name}.py" in said
+    assert inspect.getdoc(example.main)
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("quickstart_parallel", ("ended by horizon", "robot_2", "mm off its reference")),
+        ("quickstart_gymnasium", ("reference", "random residual", "ended by")),
+        ("custom_estimator", ("ekf", "ComplementaryFilter", "mm RMS")),
+        ("custom_wheel_loop", ("AVC", "PI", "mm RMS")),
+        ("custom_observer", ("paper", "delay line", "mm RMS")),
+        ("custom_policy", ("infinity, ReferencePolicy", "flower, PurePursuit", "mm RMS")),
+    ],
+)
+def test_a_short_run_prints_its_result(
+    example: ModuleType, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    example.main(horizon_s=6.0)
+    said = capsys.readouterr().out
+    assert all(word in said for word in words)
+    assert len(said.splitlines()) <= 6
+
+
+@pytest.mark.parametrize("name", ["linear_design"])
+def test_the_design_prints_margins(
+    example: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("matplotlib").use("Agg")
+    example.main(figure=tmp_path / "bode.png")
+    said = capsys.readouterr().out.splitlines()
+    for line, kappa in zip(said[:2], ("0.7705", "0.6167"), strict=True):
+        assert f"{kappa} rad/s per N·mm" in line
+        assert line.endswith("stable")
+        assert not line.endswith("unstable")
+    assert (tmp_path / "bode.png").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("name", ["train_ppo"])
+def test_training_runs_and_saves(
+    example: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example.main(steps=64, episodes=1, horizon_s=5.0, out=tmp_path / "follower.zip")
+    assert "reference" in capsys.readouterr().out
+    assert (tmp_path / "follower.zip").exists()
+
+
+# What the parts of the examples are worth, on the whole task
+
+
+@pytest.mark.parametrize(
+    ("name", "role", "part"),
+    [
+        ("custom_estimator", "estimator", "ComplementaryFilter"),
+        ("custom_wheel_loop", "wheel_loop", "PiLoop"),
+        ("custom_observer", "observer", "DelayLine"),
+    ],
+)
+@pytest.mark.slow
+def test_the_parts_hold_the_infinity(example: ModuleType, role: str, part: str) -> None:
+    env = tlf_env.parallel_env("infinity", **{role: getattr(example, part)})
+    seen, _ = env.reset(seed=0)
+    policy, errors = ReferencePolicy(), []
+    while env.agents:
+        actions = {agent: policy.predict(row)[0] for agent, row in seen.items()}
+        seen, *_, infos = env.step(actions)
+        errors.append([info["position_error_mm"] for info in infos.values()])
+    assert infos["robot_0"]["end"] == "horizon"
+    settled = np.array(errors)[len(errors) * 2 // 5 :]
+    assert np.sqrt((settled**2).mean(axis=0)).max() < 10.0
+
+
+@pytest.mark.parametrize("name", ["custom_policy"])
+def test_a_policy_of_ones_own_drives_the_others(example: ModuleType) -> None:
+    pursuit = example.PurePursuit()
+    env = FormationEnv(learner="robot_1", others=pursuit)
+    seen, _ = env.reset(seed=0)
+    for _ in range(200):
+        seen, _, terminated, truncated, _ = env.step(pursuit.predict(seen)[0])
+    assert not terminated
+    assert not truncated
+    batch = np.stack([seen, seen])
+    assert np.array_equal(pursuit.predict(batch)[0][1], pursuit.predict(seen)[0])
+    assert env.action_space.contains(pursuit.predict(seen)[0])
+
+
+@pytest.mark.parametrize("name", ["custom_observer"])
+def test_a_delay_line_moves_the_reference_as_its_twist_says(example: ModuleType) -> None:
+    from tlf_env.onboard.observer import Message
+    from tlf_env.physics.parameters import RobotParameters
+
+    line = example.DelayLine(RobotParameters(), 0.01)
+    line.reset(np.array([0.0, 0.0, 0.2]))
+    at_rest = Message(100.0, 300.0, 0.0, 0.0, 0.0)
+    references = np.array([line.update(at_rest, 0.01 * k) for k in range(701)])
+    moved = np.diff(references[:, :3], axis=0) / 0.01
+    twist = 0.5 * (references[1:, 3:] + references[:-1, 3:])
+    np.testing.assert_allclose(np.hypot(*moved[:, :2].T), twist[:, 0], atol=0.01)
+    np.testing.assert_allclose(moved[:, 2], twist[:, 1], atol=1e-4)
+    np.testing.assert_allclose(references[-1], [*at_rest], atol=1e-9)
+
+
+@pytest.mark.parametrize("name", ["quickstart_parallel", "custom_estimator"])
+@pytest.mark.slow
+def test_a_script_runs_from_the_shell(name: str) -> None:
+    done = subprocess.run(
+        [sys.executable, EXAMPLES / f"{name}.py", "--horizon-s", "6"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "robot_0" in done.stdout or "mm RMS" in done.stdout
