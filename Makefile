@@ -33,7 +33,7 @@ format: $(VENV)/.stamp-test ## Sort the imports and format the sources
 	$(BIN)/ruff check --select I --fix
 	$(BIN)/ruff format
 
-speed: $(VENV)/.stamp-run ## Measure the steps per second
+speed: $(VENV)/.stamp-test ## Measure the steps per second, beside a peer
 	$(BIN)/tlf speed
 
 # torch is fixed by hand (make constraints TORCH=...), and everything else is resolved anew. What
@@ -44,7 +44,7 @@ constraints: ## Write constraints.txt anew, from a throw-away environment with e
 	$(PYTHON) -m venv "$$tmp/venv"; \
 	py="$$tmp/venv/bin/python"; \
 	"$$py" -m pip install -q --disable-pip-version-check "torch==$(TORCH)" \
-		build editables hatchling ".[figures,view,train,bench,ray,dev]"; \
+		build editables hatchling ".[figures,view,train,bench,peers,ray,dev]"; \
 	"$$py" -m pip check; \
 	echo "# Versions of everything that the extras install. Made by: make constraints" > "$$tmp/new"; \
 	"$$py" -m pip freeze --all --exclude pip --exclude tlf-env > "$$tmp/frozen"; \
@@ -64,7 +64,7 @@ $(VENV)/.stamp-run: $(VENV)/.stamp-venv pyproject.toml constraints.txt
 	$(PIP) -c constraints.txt -e ".[figures]"
 	@touch $@
 
-# mpe2 is named alone: the extra `bench` would bring vmas, and vmas brings torch.
+# mpe2 is named alone: the extra `peers` would bring vmas, and vmas brings torch.
 $(VENV)/.stamp-test: $(VENV)/.stamp-run
-	$(PIP) -c constraints.txt -e ".[figures,dev]" mpe2
+	$(PIP) -c constraints.txt -e ".[figures,view,bench,dev]" mpe2
 	@touch $@
