@@ -25,9 +25,11 @@ from tlf_env.numerics.files import atomic
 
 Board = dict[str, Any]
 ROW_IN, POLICY_IN = 0.3, 0.16  # height of a disturbance, and of each policy within it
-PANEL_IN, LEGEND_IN = 4.4, 0.3
+PANEL_IN = 4.4
+LEGEND_ROW_IN, LEGEND_KEY_IN, LEGEND_LETTER_IN = 0.22, 0.7, 0.085
 SPREAD = 0.7  # of the room of a disturbance that its policies share
 ERROR_METRIC, ERROR_LABEL = "position_rmse_mm", "position RMS of the worst robot (mm)"
+BAND = 0.12  # opacity of an interval's band
 LOSS_LINES = ((5, ":"), (50, "--"))  # percent of runs that fail
 
 
@@ -68,14 +70,14 @@ def failures(board: Board) -> Figure:
 
 def profiles(board: Board) -> Figure:
     """Share of runs above a score, every task and disturbance weighing the same."""
-    figure = _figure(board, 7.0, 4.4 + _legend_rows(board) * LEGEND_IN)
+    figure = _figure(board, 7.0, 4.6, "tasks and disturbances weigh alike")
     axes = figure.subplots()
     for policy in policies(board):
         share = 100 * np.asarray(board["profiles"][policy])
         levels = np.linspace(0, 100, len(share))
         style = _style(board, policy)
-        axes.plot(levels, share, **style, markevery=10, lw=1.6)
-    axes.set(xlim=(0, 100), ylim=(-2, 102))
+        axes.plot(levels, share, **style, markevery=10)
+    axes.set(xlim=(-1, 101), ylim=(-2, 102))
     axes.set_xlabel("score")
     axes.set_ylabel("runs above that score (%)")
     _tidy(axes)
@@ -90,7 +92,7 @@ def sweep(board: Board) -> Figure:
         for task in _tasks(board)
         for disturbance in _disturbances(board, _cells(board, task))
     ]
-    figure = _figure(board, 10.5, 0.9 + 2.9 * len(rows) + _legend_rows(board) * LEGEND_IN)
+    figure = _figure(board, 10.5, 0.9 + 2.9 * len(rows), "95 % intervals")
     grid = figure.subplots(len(rows), 2, sharex=True, squeeze=False)
     for (task, disturbance), (success, error) in zip(rows, grid, strict=True):
         cells = [c for c in _cells(board, task) if c["disturbance"] == disturbance]
@@ -169,12 +171,13 @@ def _by_stratum(
     figure = _figure(
         board,
         1.8 + PANEL_IN * max(len(tasks), 1),
-        1.1 + row_in * most + _legend_rows(board) * LEGEND_IN,
+        1.1 + row_in * most,
+        "95 % intervals",
     )
     grid = figure.subplots(1, max(len(tasks), 1), sharex=True, sharey=False, squeeze=False)[0]
     for axes, task in zip(grid, tasks, strict=False):
         for k in range(0, len(rows[task]), 2):
-            axes.axhspan(k - 0.5, k + 0.5, color=PALE, alpha=0.5, lw=0, zorder=0)
+            axes.axhspan(k - 0.5, k + 0.5, color=PALE, alpha=0.45, lw=0, zorder=0)
         for cell in _cells(board, task):
             part = (names.index(cell["policy"]) + 0.5) / len(names) - 0.5
             middle, ends = value(cell)
@@ -207,15 +210,15 @@ def _point(
     style = _style(board, cell["policy"])
     if ends is not None:
         axes.plot(ends, [y, y], color=style["color"], lw=1.8, solid_capstyle="butt", zorder=2)
-    axes.plot([middle], [y], **{**style, "ls": "none"}, ms=5.5, zorder=3, clip_on=False)
+    axes.plot([middle], [y], **{**style, "ls": "none", "ms": 5.5}, zorder=3, clip_on=False)
 
 
 def _success_line(board: Board, axes: Axes, policy: str, cells: Sequence[dict[str, Any]]) -> None:
     values = [cell["sweep"] for cell in cells]
     ends = 100 * np.array([cell["success"]["interval"] for cell in cells])
     style = _style(board, policy)
-    axes.fill_between(values, *ends.T, color=style["color"], alpha=0.13, lw=0)
-    axes.plot(values, [100 * c["success"]["share"] for c in cells], **style, lw=1.4, ms=5)
+    axes.fill_between(values, *ends.T, color=style["color"], alpha=BAND, lw=0)
+    axes.plot(values, [100 * cell["success"]["share"] for cell in cells], **style)
 
 
 def _error_line(board: Board, axes: Axes, policy: str, cells: Sequence[dict[str, Any]]) -> None:
@@ -229,8 +232,8 @@ def _error_line(board: Board, axes: Axes, policy: str, cells: Sequence[dict[str,
     banded = [(value, *ends) for value, _, ends in rows if ends is not None]
     if banded:
         value, low, high = np.array(banded).T
-        axes.fill_between(value, low, high, color=style["color"], alpha=0.13, lw=0)
-    axes.plot([row[0] for row in rows], [row[1] for row in rows], **style, lw=1.4, ms=5)
+        axes.fill_between(value, low, high, color=style["color"], alpha=BAND, lw=0)
+    axes.plot([row[0] for row in rows], [row[1] for row in rows], **style)
 
 
 def _breaking_marks(board: Board, axes: Axes, task: str, disturbance: str) -> None:
@@ -243,8 +246,11 @@ def _breaking_marks(board: Board, axes: Axes, task: str, disturbance: str) -> No
         for percent, line in LOSS_LINES:
             at = point[f"loses_{percent}_percent_at"]
             if at is not None and math.isfinite(at):
-                colour = _style(board, point["policy"])["color"]
-                axes.plot([at, at], [-4, 100 - percent], color=colour, ls=line, lw=1.2, zorder=1.5)
+                style = _style(board, point["policy"])
+                ends = [-4, 100 - percent]
+                axes.plot(
+                    [at, at], ends, color=style["color"], lw=0.8 * style["lw"], ls=line, zorder=1.5
+                )
 
 
 def _cells(board: Board, task: str) -> list[dict[str, Any]]:
@@ -260,7 +266,10 @@ def _disturbances(board: Board, cells: Iterable[dict[str, Any]]) -> list[str]:
 
 
 def _style(board: Board, policy: str) -> dict[str, Any]:
-    """A policy's colour and marker; a privileged one's marker is hollow."""
+    """A policy's colour, marker and width; a privileged one's marker is hollow.
+
+    Later policies lie on top and are thinner, so that lines that coincide all show.
+    """
     names = policies(board)
     i = names.index(policy)
     if len(names) <= len(FEW_COLOURS):
@@ -268,7 +277,10 @@ def _style(board: Board, policy: str) -> dict[str, Any]:
     else:
         colour = to_hex(MANY_COLOURS(LIGHTEST * i / (len(names) - 1)))
     hollow = policy in _privileged(board)
+    under = (len(names) - 1 - i) / max(len(names) - 1, 1)
     return {
+        "lw": 1.2 + 1.8 * under,
+        "ms": 5.0 + 2.0 * under,
         "color": colour,
         "marker": MARKERS[i % len(MARKERS)],
         "mfc": "white" if hollow else colour,
@@ -280,44 +292,45 @@ def _privileged(board: Board) -> set[str]:
     return {row["policy"] for row in board["policies"] if row["privileged"]}
 
 
-def _figure(board: Board, width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
+def _figure(board: Board, width_in: float, height_in: float, note: str) -> Figure:
+    """A figure with room for its legend below ``height_in``."""
+    rows = -(-(len(policies(board)) + len(LOSS_LINES)) // _legend_columns(board, width_in))
+    size = (width_in, height_in + rows * LEGEND_ROW_IN)
+    figure = Figure(figsize=size, layout="constrained")
     first, end = board["plan"]["plan"]["seeds"]
     figure.suptitle(
-        f"seeds {first} to {end - 1}, the same draws for every policy; 95 % intervals",
-        fontsize="medium",
+        f"seeds {first} to {end - 1}, the same draws for all; {note}", fontsize="medium"
     )
     return figure
 
 
-def _legend_rows(board: Board) -> int:
-    return -(-len(policies(board)) // _legend_columns(board))
+def _legend_columns(board: Board, width_in: float) -> int:
+    longest = max(map(len, map(_name, board["policies"])), default=1)
+    return max(1, int(width_in / (LEGEND_KEY_IN + LEGEND_LETTER_IN * longest)))
 
 
-def _legend_columns(board: Board) -> int:
-    return 4 if len(_tasks(board)) > 1 and max(map(len, policies(board)), default=0) < 25 else 2
+def _name(row: dict[str, Any]) -> str:
+    return row["policy"] + (" (privileged)" if row["privileged"] else "")
 
 
 def _legend(board: Board, figure: Figure, more: Sequence[Line2D] = ()) -> None:
-    privileged = _privileged(board)
+    names = {row["policy"]: _name(row) for row in board["policies"]}
     handles = [
-        Line2D(
-            [], [], **_style(board, policy),
-            label=policy + (" (privileged)" if policy in privileged else ""),
-        )
+        Line2D([], [], **{**_style(board, policy), "lw": 1.6, "ms": 6.0}, label=names[policy])
         for policy in policies(board)
-    ]  # fmt: skip
+    ]
     figure.legend(
         handles=[*handles, *more],
         loc="outside lower center",
-        ncols=_legend_columns(board),
+        ncols=_legend_columns(board, figure.get_figwidth()),
         frameon=False,
+        fontsize="small",
     )
 
 
 def _tidy(*many: Axes) -> None:
     for axes in many:
-        axes.grid(color=PALE, lw=0.8)
+        axes.grid(color="0.92", lw=0.6)
         axes.set_axisbelow(True)
         axes.spines[["top", "right"]].set_visible(False)
         axes.yaxis.set_minor_locator(NullLocator())

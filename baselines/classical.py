@@ -57,13 +57,23 @@ class PurePursuit(_Memoryless):
     """Steer along the circle through the robot's place and its reference half a second from now.
 
     Coulter, "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992. The
-    speed is the reference's plus ``gain_per_s`` times the error ahead.
+    speed is the reference's plus ``gain_per_s`` times the error ahead. The place in the future is the
+    observation's first preview.
+
+    Raises
+    ------
+    ValueError
+        if there is no preview, or the first is of now.
     """
 
     def __init__(
         self, preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S, gain_per_s: float = 0.23
     ) -> None:
         super().__init__(preview_s)
+        if not preview_s or preview_s[0] <= 0:
+            raise ValueError(
+                f"pure pursuit needs a first preview above 0, got preview_s {preview_s}"
+            )
         self.gain_per_s = gain_per_s
         self._ahead = f"in_{preview_s[0]:g}_s"
 

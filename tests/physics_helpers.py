@@ -165,3 +165,7 @@ def first(starts: Callable[[float], bool], low: float, high: float, width: float
         middle = 0.5 * (low + high)
         low, high = (low, middle) if starts(middle) else (middle, high)
     return 0.5 * (low + high)
+
+
+def forward_speed(motion: Motion) -> np.ndarray:
+    return -motion.v_x * np.sin(motion.theta) + motion.v_y * np.cos(motion.theta)

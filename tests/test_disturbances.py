@@ -699,10 +699,13 @@ def test_start_outlines_never_overlap_though_unchecked_draws_would():
     assert (outline_gaps(free).min(axis=0) < 0).mean() > 0.05
 
 
-def test_a_scatter_without_room_is_refused_and_given_poses_are_taken_as_they_are():
+def test_a_scatter_without_room_is_refused_and_given_poses_are_taken_as_they_are(monkeypatch):
     formation = make()
-    with pytest.raises(ValueError, match=r"robot_\d+: no start pose without overlap"):
-        make({"start": {"position_std_mm": 0.001}}, start_spacing_mm=220.5)
+    with monkeypatch.context() as patch:
+        patch.setattr("tlf_env.task.formation._apart", lambda *_: False)
+        patch.setattr("tlf_env.task.formation.START_ATTEMPTS", 3)
+        with pytest.raises(ValueError, match=r"robot_\d+: no start pose without overlap"):
+            make({"start": {"position_std_mm": 0.001}})
     poses = formation.arrays.starts[:, :, 0].T + np.array([10.0, 20.0, 0.1])
     formation = make("start")
     formation.reset(0, poses=poses)

@@ -14,15 +14,12 @@ from tlf_env.onboard.wheel_loop import WheelLoopParameters, WheelLoopState, digi
 from tlf_env.physics.parameters import body_array
 from tlf_env.physics.state import Contact, Motion
 from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
-from tlf_env.task.channels import CHANNELS, DEAD_TIME, DROPOUT, JITTER
+from tlf_env.task.channels import CHANNELS, DEAD_TIME, JITTER
 from tlf_env.task.disturbance import Effects, leveled, patch_rows, signal_rows
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario
-
-# How far back a follower looks for the last message that did arrive.
-DROPOUT_PATIENCE_S = 2.0
 
 
 class Sensors(NamedTuple):
@@ -161,7 +158,7 @@ class Arrays(NamedTuple):
     commands: np.ndarray  # the same, or the torques (mN·mm) of a wheel loop outside
     samples: np.ndarray  # (substep, Sample, robot, lane): what the sensors said in a control step
     # on board, every control step
-    dropped: np.ndarray  # (slot, robot, lane) bool: messages that never arrive
+    dropped: np.ndarray  # (slot, robot, lane) bool: whether that broadcast was lost on the air
     messages: np.ndarray  # (Message, slot, robot, lane): ring over one gap
     observers: np.ndarray  # (x y θ, robot, lane)
     references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
@@ -208,7 +205,7 @@ def longest(scenario: Scenario, channel: int) -> float:
     """The largest value that a channel can have; its range's end if an adversary may set it."""
     if scenario.adversary:
         return CHANNELS[channel].high
-    reach = scenario.disturbance.signal(CHANNELS[channel].path).reach()
+    reach = scenario.disturbance.signal(CHANNELS[channel].path).reach(CHANNELS[channel].nominal)
     level = scenario.disturbance.level
     return max(leveled(CHANNELS[channel].nominal, end, level) for end in reach)
 
@@ -228,8 +225,7 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
 
     dead = round(longest(scenario, DEAD_TIME) / scenario.physics_period_s)
     late = math.ceil(longest(scenario, JITTER) / scenario.control_period_s)
-    patience = math.ceil(DROPOUT_PATIENCE_S / scenario.control_period_s)
-    ring = gap + 1 + late + (patience if longest(scenario, DROPOUT) > 0 else 0)
+    ring = gap + 1 + late
 
     def zeros(fields: int) -> np.ndarray:
         return np.zeros((fields, n, lanes))

@@ -123,7 +123,7 @@ class Disturbance(Frozen):
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
         for channel in CHANNELS:
-            for end in self.signal(channel.path).reach():
+            for end in self.signal(channel.path).reach(channel.nominal):
                 value = leveled(channel.nominal, end, self.level)
                 if not channel.low <= value <= channel.high:
                     raise ValueError(
@@ -176,8 +176,8 @@ def signal_rows(disturbance: Disturbance, dt_s: float, control_period_s: float) 
     periods = [dt_s] * SUBSTEP_CHANNELS + [control_period_s] * (len(PATHS) - SUBSTEP_CHANNELS)
     return np.array(
         [
-            disturbance.signal(path).row(dt_s, period)
-            for path, period in zip(PATHS, periods, strict=True)
+            disturbance.signal(channel.path).row(dt_s, period, channel.nominal)
+            for channel, period in zip(CHANNELS, periods, strict=True)
         ]
     )
 

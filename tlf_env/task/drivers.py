@@ -518,20 +518,15 @@ def wanted_of_formation(a: Arrays, lane: int, r: int, step: int, gap: int) -> tu
 def message_slot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> int:
     """Where the message is that robot ``r`` uses at a control step: one gap old, or older.
 
-    Jitter makes it older by a fresh draw for each step; a message that was dropped is replaced by the
-    last one that was not. Before the first gap has passed it is the predecessor's start.
+    Jitter makes it older by a fresh draw for each step, up to whole control periods within it. Before
+    the first gap has passed it is the predecessor's start.
     """
     late = 0
     jitter = a.applied[JITTER, r, lane]
     if jitter > 0.0:
         word, _, _, _ = words(a.seeds[lane], RADIO_JITTER, r, a.clock[lane, 2], step)
-        late = int(unit(word) * (jitter / s.period + 1.0))
-    slots = a.messages.shape[1]
-    now = a.clock[lane, 1]
-    sent = max(step - s.gap - late, 0)
-    while a.dropped[sent % slots, r - 1, lane] and sent > 0 and sent > now - slots + 1:
-        sent -= 1
-    return sent % slots
+        late = int(unit(word) * (math.floor(jitter / s.period + 1e-9) + 1.0))
+    return max(step - s.gap - late, 0) % a.messages.shape[1]
 
 
 @law
@@ -604,6 +599,10 @@ def broadcast(a: Arrays, lane: int, r: int, step: int, period: float) -> None:
         word, _, _, _ = words(a.seeds[lane], RADIO_DROPOUT, r, a.clock[lane, 2], step)
         lost = unit(word) < dropout
     a.dropped[slot, r, lane] = lost
+    if lost:  # whoever listens goes on with the last message that arrived
+        before = (step - 1) % a.messages.shape[1]
+        for i in range(a.messages.shape[0]):
+            a.messages[i, slot, r, lane] = a.messages[i, before, r, lane]
 
 
 @block
@@ -768,6 +767,18 @@ def look_lane(a: Arrays, lane: int, s: Settings) -> None:
     if s.cooperative:
         mean = a.rewards[lane].mean()
         a.rewards[lane, :] = mean
+
+
+@driver
+def message_slot_of(a: Arrays, r: int, step: int, s: Settings) -> int:
+    """:func:`message_slot` of lane 0, for observers outside."""
+    return message_slot(a, 0, r, step, s)
+
+
+@driver
+def delays_of(a: Arrays, r: int, dt: float) -> tuple[int, int]:
+    """:func:`delays` of lane 0, for wheel loops outside."""
+    return delays(a, 0, r, dt)
 
 
 @driver

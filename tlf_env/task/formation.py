@@ -30,7 +30,7 @@ from tlf_env.task.channels import (
 from tlf_env.task.disturbance import changes_within_episode, loaded_body
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.parts import Parts, part_factories
-from tlf_env.task.scenario import Scenario
+from tlf_env.task.scenario import START_MARGIN_MM, Scenario
 from tlf_env.task.trajectories import sample
 
 
@@ -48,7 +48,6 @@ STATE_SCALES = np.array(
 
 PAYLOAD = [PAYLOAD_MASS, PAYLOAD_BEHIND, PAYLOAD_INERTIA]
 START_ATTEMPTS = 1000
-START_MARGIN_MM = 1.0
 
 
 class Formation:
@@ -141,7 +140,11 @@ class Formation:
         ValueError
             for an unknown channel, one that cannot change within an episode, or a value out of range.
         """
-        a = self.arrays
+        a, robots = self.arrays, self.scenario.robot_count
+        if not self.scenario.adversary:
+            raise ValueError(
+                "channels can be set within an episode only if the scenario has adversary: true"
+            )
         a.imposed[:] = np.nan
         for path, value in values.items():
             if path not in PATHS[:STEP_CHANNELS]:
@@ -150,10 +153,17 @@ class Formation:
                     f"{', '.join(PATHS[:STEP_CHANNELS])}"
                 )
             channel = CHANNELS[PATHS.index(path)]
-            row = np.broadcast_to(np.asarray(value, dtype=np.float64), a.imposed.shape[1:2])
-            if not ((row >= channel.low) & (row <= channel.high)).all():
+            high = channel.high
+            if path == "actuator.computing_delay_s":
+                high = min(high, self.scenario.control_period_s)
+            row = np.asarray(value, dtype=np.float64)
+            if row.shape not in ((), (robots,)):
                 raise ValueError(
-                    f"{path} {value!r} is out of its range, {channel.low:g} to {channel.high:g}"
+                    f"{path} must be a number or one per robot ({robots}), got {value!r}"
+                )
+            if not ((row >= channel.low) & (row <= high)).all():
+                raise ValueError(
+                    f"{path} {value!r} is out of its range, {channel.low:g} to {high:g}"
                 )
             a.imposed[PATHS.index(path), :, 0] = row
 
@@ -198,7 +208,7 @@ class Formation:
     def _substep_by_substep(self, close: bool) -> None:
         a, s = self.arrays, self._settings
         for k in range(s.substeps):
-            self._parts.drive(a)
+            self._parts.drive(a, k, s)
             before = a.motions.copy() if close else a.motions
             drivers.actuate(a, k, s)
             if close:

@@ -147,7 +147,7 @@ class StringMetrics(NamedTuple):
 
     time_gain: (
         float | None
-    )  # largest ratio of the followers' RMS formation error to the predecessor's
+    )  # largest ratio of a follower's RMS deviation across the path to its predecessor's
     frequency_gain: float | None  # largest gain of the error's spectrum between neighbours
     frequency_Hz: float | None  # where that is
 
@@ -179,7 +179,7 @@ def string_metrics(
         mine = across[i][start : steps - i * scenario.gap_steps]
         theirs = across[i - 1][start : start + len(mine)]
         ahead, behind = rms(theirs), rms(mine)
-        if not ahead or not behind:
+        if not ahead or behind is None:
             continue
         gains.append(behind / ahead)
         options = {

@@ -74,12 +74,14 @@ class Parts:
     def _of(self, role: str) -> list[Any]:
         return self._made.get(role, [])
 
-    def drive(self, a: Arrays) -> None:
+    def drive(self, a: Arrays, k: int, s: drivers.Settings) -> None:
         """Wheel loops: put torques in the place of the commands that :attr:`Arrays.wanted` keeps."""
         for r, loop in enumerate(self._of("wheel_loop")):
             if a.kinds[r, 0] == TORQUE:
                 continue
-            wanted, measured = a.wanted[:, r, 0].copy(), a.sensors[SPEEDS, r, 0]
+            _, hold = drivers.delays_of(a, r, s.dt)
+            wanted = (a.wanted_before if k < hold else a.wanted)[:, r, 0].copy()
+            measured = a.sensors[SPEEDS, r, 0]
             torques = finite(
                 loop.torque(wanted, measured), 2, f"robot_{r}: the wheel loop's torque()"
             )
@@ -98,7 +100,7 @@ class Parts:
             self._observe_one(a, s, r, int(a.clock[0, 1]) + s.lookahead)
 
     def _observe_one(self, a: Arrays, s: drivers.Settings, r: int, m: int) -> None:
-        old = max(m - s.gap, 0) % a.messages.shape[1]
+        old = drivers.message_slot_of(a, r, m, s)
         message = Message(*a.messages[:, old, r - 1, 0].tolist())
         reference = self._made["observer"][r].update(message, m * s.period)
         row = finite(tuple(reference), 5, f"robot_{r}: the observer's update()")

@@ -28,6 +28,7 @@ PACKAGE = Path(__file__).resolve().parent.parent
 MAX_ROBOTS = 1000
 DEFAULT_CONTROL_PERIOD_S = 0.02
 SETTLE_FRACTION = 0.4
+START_MARGIN_MM = 1.0  # between outlines at the start
 DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
 
@@ -176,9 +177,9 @@ class Scenario(Frozen):
                 f"horizon_s {self.horizon_s} is more than {MAX_STEPS} steps of physics_period_s"
             )
         room_mm = 2 * max(robot.outline_radius_mm for robot in self.robot_models)
-        if self.robot_count > 1 and self.start_spacing_mm <= room_mm:
+        if self.robot_count > 1 and self.start_spacing_mm <= room_mm + START_MARGIN_MM:
             raise ValueError(
-                f"start_spacing_mm {self.start_spacing_mm} must be above {room_mm:g}, or the "
+                f"start_spacing_mm {self.start_spacing_mm} must be above {room_mm + START_MARGIN_MM:g}, or the "
                 "robots touch at the start"
             )
         delay = self.disturbance.signal("actuator.computing_delay_s").reach()[1]

@@ -25,12 +25,19 @@ class SignalRow(NamedTuple):
     every: float  # ticks between draws; 0: one draw per episode
 
 
+def _or(value: float | None, nominal: float) -> float:
+    return nominal if value is None else value
+
+
 class _Signal(Frozen):
-    def row(self, dt_s: float, period_s: float) -> SignalRow:
-        """The compiled form for a tick of ``dt_s`` s, if evaluated once per ``period_s`` s."""
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
+        """The compiled form for a tick of ``dt_s`` s, if evaluated once per ``period_s`` s.
+
+        ``nominal`` is the channel's value without a disturbance, where a field is None.
+        """
         raise NotImplementedError
 
-    def reach(self) -> tuple[float, float]:
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
         """Smallest and largest value; four standard deviations where there is no bound."""
         raise NotImplementedError
 
@@ -45,11 +52,11 @@ class Constant(_Signal):
     type: Literal["constant"] = "constant"
     value: FiniteFloat
 
-    def row(self, dt_s: float, period_s: float) -> SignalRow:
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
         return SignalRow(CONSTANT, self.value, 0.0, 0.0, 0.0)
 
-    def reach(self) -> tuple[float, float]:
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
         """The value."""
         return self.value, self.value
 
@@ -64,15 +71,16 @@ class Step(_Signal):
     type: Literal["step"] = "step"
     value: FiniteFloat
     at_s: NonNegative
-    before: FiniteFloat = 0.0
+    before: FiniteFloat | None = None  # None: the channel's nominal value
 
-    def row(self, dt_s: float, period_s: float) -> SignalRow:
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
-        return SignalRow(STEP, self.value, self.at_s, self.before, 0.0)
+        return SignalRow(STEP, self.value, self.at_s, _or(self.before, nominal), 0.0)
 
-    def reach(self) -> tuple[float, float]:
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
         """The two values."""
-        return min(self.value, self.before), max(self.value, self.before)
+        before = _or(self.before, nominal)
+        return min(self.value, before), max(self.value, before)
 
 
 class Impulse(_Signal):
@@ -82,15 +90,16 @@ class Impulse(_Signal):
     value: FiniteFloat
     at_s: NonNegative
     duration_s: Positive
-    rest: FiniteFloat = 0.0
+    rest: FiniteFloat | None = None  # None: the channel's nominal value
 
-    def row(self, dt_s: float, period_s: float) -> SignalRow:
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`; the duration travels in ``every`` as seconds."""
-        return SignalRow(IMPULSE, self.value, self.at_s, self.rest, self.duration_s)
+        return SignalRow(IMPULSE, self.value, self.at_s, _or(self.rest, nominal), self.duration_s)
 
-    def reach(self) -> tuple[float, float]:
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
         """The two values."""
-        return min(self.value, self.rest), max(self.value, self.rest)
+        rest = _or(self.rest, nominal)
+        return min(self.value, rest), max(self.value, rest)
 
 
 class Sine(_Signal):
@@ -100,16 +109,17 @@ class Sine(_Signal):
     amplitude: FiniteFloat
     frequency_hz: Positive
     phase_rad: FiniteFloat = 0.0
-    mean: FiniteFloat = 0.0
+    mean: FiniteFloat | None = None  # None: the channel's nominal value
 
-    def row(self, dt_s: float, period_s: float) -> SignalRow:
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`; the mean travels in ``every``."""
         rate = 2 * math.pi * self.frequency_hz
-        return SignalRow(SINE, self.amplitude, rate, self.phase_rad, self.mean)
+        return SignalRow(SINE, self.amplitude, rate, self.phase_rad, _or(self.mean, nominal))
 
-    def reach(self) -> tuple[float, float]:
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
         """Mean ± amplitude."""
-        return self.mean - abs(self.amplitude), self.mean + abs(self.amplitude)
+        mean = _or(self.mean, nominal)
+        return mean - abs(self.amplitude), mean + abs(self.amplitude)
 
 
 class _Drawn(_Signal):
@@ -137,11 +147,11 @@ class Uniform(_Drawn):
             raise ValueError(f"low {self.low} is above high {self.high}")
         return self
 
-    def row(self, dt_s: float, period_s: float) -> SignalRow:
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
         return SignalRow(UNIFORM, self.low, self.high - self.low, 0.0, self.ticks(dt_s))
 
-    def reach(self) -> tuple[float, float]:
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
         """The two ends."""
         return self.low, self.high
 
@@ -151,15 +161,16 @@ class Gaussian(_Drawn):
 
     type: Literal["gaussian"] = "gaussian"
     std: NonNegative
-    mean: FiniteFloat = 0.0
+    mean: FiniteFloat | None = None  # None: the channel's nominal value
 
-    def row(self, dt_s: float, period_s: float) -> SignalRow:
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
-        return SignalRow(GAUSSIAN, self.mean, self.std, 0.0, self.ticks(dt_s))
+        return SignalRow(GAUSSIAN, _or(self.mean, nominal), self.std, 0.0, self.ticks(dt_s))
 
-    def reach(self) -> tuple[float, float]:
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
         """Mean ± 4 standard deviations."""
-        return self.mean - TAILS * self.std, self.mean + TAILS * self.std
+        mean = _or(self.mean, nominal)
+        return mean - TAILS * self.std, mean + TAILS * self.std
 
 
 class OrnsteinUhlenbeck(_Signal):
@@ -168,17 +179,22 @@ class OrnsteinUhlenbeck(_Signal):
     type: Literal["ornstein_uhlenbeck"] = "ornstein_uhlenbeck"
     std: NonNegative
     time_constant_s: Positive
-    mean: FiniteFloat = 0.0
+    mean: FiniteFloat | None = None  # None: the channel's nominal value
 
-    def row(self, dt_s: float, period_s: float) -> SignalRow:
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
         return SignalRow(
-            ORNSTEIN_UHLENBECK, self.mean, self.std, math.exp(-period_s / self.time_constant_s), 0.0
+            ORNSTEIN_UHLENBECK,
+            _or(self.mean, nominal),
+            self.std,
+            math.exp(-period_s / self.time_constant_s),
+            0.0,
         )
 
-    def reach(self) -> tuple[float, float]:
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
         """Mean ± 4 standard deviations."""
-        return self.mean - TAILS * self.std, self.mean + TAILS * self.std
+        mean = _or(self.mean, nominal)
+        return mean - TAILS * self.std, mean + TAILS * self.std
 
 
 Signal = Annotated[

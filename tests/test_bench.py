@@ -1,0 +1,358 @@
+"""The benchmark: resumed after any interruption, the same table however it is run, clear refusals."""
+
+import json
+import os
+import random
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+pytest.importorskip("arch")
+
+from baselines import bench
+from baselines.aggregate import leaderboard, write_leaderboard
+from baselines.bench import Cell, Plan, parse_seeds, parse_sweep, run_bench, with_value
+from baselines.run import run_policy
+from tlf_env.cli import main
+from tlf_env.task.observation import sensor_entries
+from tlf_env.task.scenario import load_scenario
+
+SHORT = (("horizon_s", 2.0),)
+PLAN = Plan(
+    policies=("reference:consistent", "pure_pursuit"),
+    tasks=("infinity",),
+    disturbances=("nominal", "start"),
+    seeds=(20_000, 20_003),
+    overrides=SHORT,
+)
+COMMAND = [sys.executable, "-c", "from tlf_env.cli import main; main()", "bench"]
+ARGUMENTS = [
+    *("--policies", "reference:consistent,pure_pursuit"),
+    *("--tasks", "infinity"),
+    *("--disturbances", "nominal,start"),
+    *("--seeds", "20000:20030"),
+    *("--horizon-s", "5"),
+    "--no-figures",
+]
+RUNS_IN_ALL = 2 * 2 * 30
+
+
+def lines_in(folder: Path) -> int:
+    path = folder / bench.RUNS
+    return path.read_bytes().count(b"\n") if path.exists() else 0
+
+
+def started(folder: Path, processes: int) -> subprocess.Popen:
+    """`tlf bench` in a process group of its own."""
+    places = ["--out", str(folder), "--processes", str(processes)]
+    return subprocess.Popen(
+        [*COMMAND, *ARGUMENTS, *places],
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE,
+        start_new_session=True,
+    )
+
+
+def wait_for(condition, timeout_s: float = 120) -> None:
+    end = time.monotonic() + timeout_s
+    while not condition():
+        assert time.monotonic() < end
+        time.sleep(0.005)
+
+
+def group_is_gone(group: int) -> bool:
+    try:
+        os.killpg(group, 0)
+    except ProcessLookupError:
+        return True
+    return False
+
+
+def end_group(group: int) -> None:
+    if not group_is_gone(group):
+        os.killpg(group, signal.SIGKILL)
+
+
+def tables(folder: Path) -> tuple[dict, str]:
+    board = json.loads((folder / "leaderboard.json").read_text())
+    del board["plan"]["git_revision"], board["plan"]["versions"]
+    return board, (folder / "leaderboard.md").read_text()
+
+
+@pytest.mark.slow
+def test_a_bench_that_is_killed_three_times_ends_with_the_same_tables(tmp_path):
+    whole, killed = tmp_path / "whole", tmp_path / "killed"
+    assert started(whole, 1).wait(300) == 0
+    rng = random.Random()
+    for number in range(3):
+        process = started(killed, 1 + number % 2)
+        try:
+            enough = lines_in(killed) + rng.randrange(1, RUNS_IN_ALL // 5)
+            wait_for(lambda enough=enough: lines_in(killed) >= enough)
+            process.send_signal(signal.SIGKILL)
+            process.wait()
+            wait_for(lambda group=process.pid: group_is_gone(group), 30)  # no worker is left behind
+        finally:
+            end_group(process.pid)
+    assert lines_in(killed) < RUNS_IN_ALL
+    assert started(killed, 2).wait(300) == 0
+    assert lines_in(killed) == RUNS_IN_ALL
+    assert tables(killed) == tables(whole)
+
+
+def test_what_is_finished_is_not_run_again(tmp_path, monkeypatch):
+    real, run = bench.run_cell, []
+
+    def breaks_at_the_fifth(plan, cell):
+        run.append(cell)
+        if len(run) == 5:
+            raise RuntimeError
+        return real(plan, cell)
+
+    monkeypatch.setattr(bench, "run_cell", breaks_at_the_fifth)
+    with pytest.raises(RuntimeError):
+        run_bench(PLAN, tmp_path)
+    assert lines_in(tmp_path) == 4
+    results = run_bench(PLAN, tmp_path)
+    assert run == [*PLAN.cells()[:5], *PLAN.cells()[4:]]
+    assert not results.missing()
+    before = (tmp_path / bench.RUNS).stat()
+    assert run_bench(PLAN, tmp_path).ordered() == results.ordered()
+    assert (tmp_path / bench.RUNS).stat() == before
+
+
+def test_a_torn_last_line_is_cut_and_run_again(tmp_path):
+    whole = run_bench(PLAN, tmp_path).ordered()
+    path = tmp_path / bench.RUNS
+    path.write_bytes(path.read_bytes()[:-30])
+    assert run_bench(PLAN, tmp_path).ordered() == whole
+    assert lines_in(tmp_path) == len(PLAN.cells())
+
+
+def test_a_damaged_line_is_told(tmp_path):
+    run_bench(PLAN, tmp_path)
+    path = tmp_path / bench.RUNS
+    path.write_bytes(b"{}\n" + path.read_bytes())
+    with pytest.raises(ValueError, match=r"runs\.jsonl, line 1 is damaged"):
+        run_bench(PLAN, tmp_path)
+
+
+def test_the_table_does_not_depend_on_the_number_of_processes(tmp_path):
+    one, two = (run_bench(PLAN, tmp_path / f"{n}", processes=n) for n in (1, 2))
+    assert one.ordered() == two.ordered()
+    for results in (one, two):
+        write_leaderboard(results, results.folder, "tlf bench")
+    names = ("leaderboard.md", "leaderboard.json")
+    first, second = ([(r.folder / name).read_bytes() for name in names] for r in (one, two))
+    assert first == second
+
+
+@pytest.mark.slow
+def test_the_table_is_the_same_from_a_ray_cluster(tmp_path):
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    cluster = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False}
+    )
+    try:
+        far = run_bench(PLAN, tmp_path / "ray", ray_address=cluster.address)
+    finally:
+        cluster.shutdown()
+    assert far.ordered() == run_bench(PLAN, tmp_path / "here").ordered()
+
+
+class Circling:
+    """Drives in a circle and keeps what it sees."""
+
+    def __init__(self, turn):
+        self.turn, self.seen = turn, []
+
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        self.seen.append(observation)
+        return np.full((len(observation), 2), (0.1, self.turn)), state
+
+
+def test_policies_meet_the_same_starts_and_noise():
+    scenario = load_scenario(
+        disturbance="start", observation="sensor", dtype="float64", horizon_s=2.0
+    )
+    entries = sensor_entries(scenario.substeps)
+    place = list(entries).index(f"fix_x_{scenario.substeps - 1}")
+    scale = entries[f"fix_x_{scenario.substeps - 1}"].scale
+    starts, paths, noise = [], [], []
+    for turn in (-0.1, 0.1):
+        policy = Circling(turn)
+        x = run_policy(scenario, policy, 20_000)["x_mm"]
+        fixes = scale * np.array(policy.seen)[1:, :, place]
+        starts.append(x[0])
+        paths.append(x)
+        noise.append(fixes - (x[1:-1] - x[0]))
+    np.testing.assert_array_equal(*starts)
+    np.testing.assert_allclose(*noise, atol=1e-9)
+    assert 0.3 < np.std(noise[0]) < 0.6
+    assert np.abs(paths[0] - paths[1]).max() > 10
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"seeds": (20_000, 20_004)},
+        {"policies": ("reference:consistent",)},
+        {"level": 0.5},
+        {"overrides": (("horizon_s", 3.0),)},
+    ],
+)
+def test_another_plan_in_the_same_folder_is_refused(tmp_path, change):
+    run_bench(PLAN, tmp_path)
+    before = {path: path.read_bytes() for path in tmp_path.iterdir()}
+    with pytest.raises(ValueError, match="holds results of another plan"):
+        run_bench(Plan(**(vars(PLAN) | change)), tmp_path)
+    assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
+
+
+def test_a_policy_whose_file_changed_is_refused(tmp_path, monkeypatch):
+    (tmp_path / "changing.py").write_text(
+        "import numpy as np\n"
+        "class Still:\n"
+        "    def predict(self, seen, state=None, episode_start=None, deterministic=True):\n"
+        "        return np.zeros((len(seen), 2)), state\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    plan = Plan(("changing:Still",), ("infinity",), ("nominal",), (0, 1), overrides=SHORT)
+    run_bench(plan, tmp_path / "out")
+    with (tmp_path / "changing.py").open("a") as file:
+        file.write("# changed\n")
+    with pytest.raises(ValueError, match="another policies"):
+        run_bench(plan, tmp_path / "out")
+
+
+def test_a_sweep_runs_every_value():
+    path, values = parse_sweep("slip.delta_1_mm_s=0:40:5")
+    assert (path, values) == ("slip.delta_1_mm_s", (0, 10, 20, 30, 40))
+    plan = Plan(**(vars(PLAN) | {"sweep": path, "sweep_values": values, "seeds": (0, 1)}))
+    assert [cell.sweep for cell in plan.cells()[:10:2]] == list(values)
+    for value in values:
+        scenario = plan.scenario(Cell("", "infinity", "start", 1.0, value, 0))
+        assert scenario.disturbance.slip.delta_1_mm_s.value == value
+        assert scenario.disturbance.start.position_std_mm.value > 0
+    level = Plan(**(vars(plan) | {"sweep": "level"}))
+    assert level.scenario(Cell("", "infinity", "ice", 1.0, 0.5, 0)).disturbance.level == 0.5
+
+
+def test_a_swept_bench_tells_where_policies_break(tmp_path):
+    plan = Plan(
+        ("reference:consistent",), ("infinity",), ("nominal",), (0, 2), overrides=SHORT,
+        sweep="slip.delta_1_mm_s", sweep_values=(0.0, 2000.0),
+    )  # fmt: skip
+    board = leaderboard(run_bench(plan, tmp_path))
+    assert [cell["sweep"] for cell in board["cells"]] == [0, 2000]
+    (row,) = board["breaking_points"]
+    assert row["loses_50_percent_at"] == 1000
+
+
+def test_only_numbers_that_exist_can_be_swept():
+    tree = {"a": {"b": 1}, "c": 2}
+    assert with_value(tree, "a.b", 5) == {"a": {"b": 5}, "c": 2}
+    assert tree["a"]["b"] == 1
+    for path in ("x", "a.x", "c.d"):
+        with pytest.raises(ValueError, match="sweep:"):
+            with_value(tree, path, 5)
+
+
+@pytest.mark.parametrize(
+    "text", ["", "a", "a=1", "a=1:2", "a=1:2:1", "a=1:2:3:4", "=1:2:3", "a=x:2:3"]
+)
+def test_a_sweep_of_another_form_is_told(text):
+    with pytest.raises(ValueError, match="must be PATH=FIRST:LAST:COUNT"):
+        parse_sweep(text)
+
+
+@pytest.mark.parametrize("text", ["", "5", "5:5", "6:5", "-1:5", "a:b", "1:2:3"])
+def test_seeds_of_another_form_are_told(text):
+    with pytest.raises(ValueError, match="must be FIRST:END"):
+        parse_seeds(text)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("--policies no_such", "no_such"),
+        ("--policies pure_pursuit,pure_pursuit", "each once"),
+        ("--policies model.zip", "--trust"),
+        ("--tasks no_such", "no_such"),
+        ("--tasks infinity,no_such", "no_such"),
+        ("--tasks sensor.yaml", "takes 'tracking' observations"),
+        ("--disturbances no_such", "no_such"),
+        ("--disturbances nominal,no_such", "no_such"),
+        ("--sweep slip.no_such=0:1:2", "no_such"),
+        ("--sweep no_such=0:1:2", "no_such"),
+        ("--sweep tyre.friction_scale=1:-1:3", "friction_scale"),
+        ("--disturbances nominal,ice --sweep level=0:3:4", "friction_scale"),
+        ("--sweep slip.delta_1_mm_s=nan:1:2", "delta_1_mm_s"),
+        ("--seeds 5", "FIRST:END"),
+        ("--seeds 0:99999999999999999999999", "seed"),
+        ("--level -1", "level"),
+        ("--horizon-s 0.03", "horizon_s"),
+        ("--processes -1", "processes"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(words, said, tmp_path, monkeypatch, capsys):
+    (tmp_path / "sensor.yaml").write_text(
+        "observation: sensor\ntrajectory: {type: circle, radius_mm: 800, speed_mm_s: 200}\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    defaults = {"--policies": "pure_pursuit", "--tasks": "infinity", "--disturbances": "nominal"}
+    for name, value in defaults.items():
+        if name not in words:
+            words += f" {name} {value}"
+    monkeypatch.setattr(sys, "argv", ["tlf", "bench", *words.split(), "--out", "out"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    told = capsys.readouterr().err
+    assert told.count("\n") == 1
+    assert said in told
+    assert not list((tmp_path / "out").glob("*"))
+
+
+def test_a_bench_without_arch_says_so_before_it_runs(tmp_path, monkeypatch):
+    monkeypatch.setattr(bench, "find_spec", lambda name: None)
+    with pytest.raises(ValueError, match=r"pip install 'tlf-env\[bench\]'"):
+        run_bench(PLAN, tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_an_error_in_a_worker_is_not_swallowed(tmp_path, monkeypatch):
+    (tmp_path / "breaking.py").write_text(
+        "class Breaking:\n"
+        "    def predict(self, seen, state=None, episode_start=None, deterministic=True):\n"
+        "        raise ValueError('no idea')\n"
+    )
+    monkeypatch.syspath_prepend(tmp_path)
+    plan = Plan(("breaking:Breaking",), ("infinity",), ("nominal",), (0, 3), overrides=SHORT)
+    with pytest.raises(ValueError, match="no idea"):
+        run_bench(plan, tmp_path / "out", processes=2)
+
+
+def test_the_figures_are_drawn_from_what_the_table_holds(tmp_path):
+    pytest.importorskip("matplotlib")
+    from baselines.bench_figures import knob_label, write_bench_figures
+
+    board = write_leaderboard(run_bench(PLAN, tmp_path), tmp_path, "tlf bench")
+    written = write_bench_figures(board, tmp_path)
+    assert [path.name for path in written] == ["scores.png", "failures.png", "profiles.png"]
+    swept = Plan(
+        **(vars(PLAN) | {"sweep": "level", "sweep_values": (0.0, 1.0), "seeds": (0, 1)})
+    )  # a single seed: no intervals
+    board = leaderboard(run_bench(swept, tmp_path / "swept"))
+    written = write_bench_figures(board, tmp_path / "swept")
+    assert written[-1].name == "sweep.png"
+    assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
+    assert knob_label("slip.delta_1_mm_s") == "slip.delta_1 (mm/s)"
+    assert knob_label("level") == "level"

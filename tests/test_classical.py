@@ -1,0 +1,119 @@
+"""The classical rivals: exact on an exact reference, their gains, and that they hold the tasks."""
+
+import math
+
+import numpy as np
+import pytest
+
+from baselines.classical import DEFAULT_PREVIEW_S, FeedbackLinearisation, PurePursuit
+from baselines.policies import make_policy
+from baselines.run import run_policy
+from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
+from tlf_env.task.observation import tracking_entries
+from tlf_env.task.scenario import load_scenario
+
+ENTRIES = tracking_entries(DEFAULT_PREVIEW_S)
+RIVALS = [PurePursuit, FeedbackLinearisation]
+TWISTS = [(400.0, 0.0), (300.0, 0.5), (250.0, -0.8), (0.0, 0.0)]
+
+
+def row(**seen):
+    """A scaled observation of what is named; a heading error of 0 unless told."""
+    values = {"cos_e_3": 1.0} | seen
+    return np.array([values.get(name, 0.0) / entry.scale for name, entry in ENTRIES.items()])
+
+
+def ahead(u_1, u_2, time_s):
+    """Forward and right of where a robot with that twist will be."""
+    turn = u_2 * time_s
+    if abs(u_2) < 1e-12:
+        return u_1 * time_s, 0.0
+    return u_1 / u_2 * math.sin(turn), -u_1 / u_2 * (1 - math.cos(turn))
+
+
+def twist_of(action):
+    return action * (FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S)
+
+
+@pytest.mark.parametrize("rival", RIVALS)
+@pytest.mark.parametrize("twist", TWISTS)
+def test_without_error_the_twist_is_the_references(rival, twist):
+    forward, right = ahead(*twist, 0.5)
+    places = {"forward_in_0.5_s": forward, "right_in_0.5_s": right}
+    seen = row(reference_u_1=twist[0], reference_u_2=twist[1], **places)
+    action, state = rival().predict(seen, "memory")
+    assert twist_of(action) == pytest.approx(twist, abs=1e-9)
+    assert state == "memory"
+
+
+@pytest.mark.parametrize("gain", [0.5, 2.0])
+def test_the_error_of_the_point_ahead_decays_with_the_gain(gain):
+    policy = FeedbackLinearisation(gain_per_s=gain)
+    b, dt = policy.ahead_mm, 1e-3
+    u_1, u_2 = 300.0, 0.4
+    robot, goal = np.array([40.0, -60.0, 0.5]), np.zeros(3)  # x, y, θ; 0 faces +y
+
+    def point(pose):
+        return pose[:2] + b * np.array([-math.sin(pose[2]), math.cos(pose[2])])
+
+    def moved(pose, forward, turn):
+        middle = pose[2] + turn * dt / 2
+        step = forward * dt * np.array([-math.sin(middle), math.cos(middle)])
+        return np.array([*(pose[:2] + step), pose[2] + turn * dt])
+
+    first = point(goal) - point(robot)
+    for _ in range(1000):
+        d_x, d_y = goal[:2] - robot[:2]
+        sin, cos = math.sin(robot[2]), math.cos(robot[2])
+        seen = {
+            "e_1": -sin * d_x + cos * d_y,
+            "e_2": cos * d_x + sin * d_y,
+            "sin_e_3": math.sin(goal[2] - robot[2]),
+            "cos_e_3": math.cos(goal[2] - robot[2]),
+            "reference_u_1": u_1,
+            "reference_u_2": u_2,
+        }
+        robot = moved(robot, *policy.twist({name: np.float64(x) for name, x in seen.items()}))
+        goal = moved(goal, u_1, u_2)
+    assert point(goal) - point(robot) == pytest.approx(math.exp(-gain) * first, abs=0.3)
+
+
+@pytest.mark.parametrize("rival", RIVALS)
+def test_a_batch_is_its_rows(rival):
+    rows = np.random.default_rng(0).uniform(-1, 1, (6, len(ENTRIES))).astype(np.float32)
+    policy = rival()
+    batch, _ = policy.predict(rows)
+    assert batch.dtype == np.float32
+    assert np.abs(batch).max() <= 1
+    np.testing.assert_array_equal(batch, [policy.predict(one)[0] for one in rows])
+
+
+@pytest.mark.parametrize("rival", RIVALS)
+@pytest.mark.parametrize("shape", [(), (3,), (2, len(ENTRIES) + 1), (1, 1, len(ENTRIES))])
+def test_a_wrong_shape_is_told(rival, shape):
+    with pytest.raises(ValueError, match="takes tracking observations of"):
+        rival().predict(np.zeros(shape))
+
+
+def test_pure_pursuit_turns_towards_the_point_ahead():
+    for right in (-50.0, 50.0):
+        seen = row(reference_u_1=300.0, **{"forward_in_0.5_s": 150.0, "right_in_0.5_s": right})
+        assert np.sign(PurePursuit().predict(seen)[0][1]) == -np.sign(right)
+
+
+def test_pure_pursuit_needs_a_point_ahead():
+    for preview_s in ((), (0.0, 1.0)):
+        with pytest.raises(ValueError, match="preview"):
+            make_policy("pure_pursuit", load_scenario(preview_s=preview_s))
+
+
+@pytest.mark.parametrize("name", ["pure_pursuit", "feedback_linearisation"])
+@pytest.mark.parametrize("task", ["infinity", "flower"])
+def test_it_holds_the_task(name, task):
+    scenario = load_scenario(task)
+    assert scenario.control_period_s == 0.02
+    record = run_policy(scenario, make_policy(name, scenario), 10_000)
+    for metrics in record.metrics():
+        assert metrics.position_rmse_mm < 6
+        assert not metrics.lost
+        assert not metrics.touched

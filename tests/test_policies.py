@@ -1,0 +1,111 @@
+"""Policies by name: what is made, what is refused and in which words."""
+
+import numpy as np
+import pytest
+
+from baselines.policies import make_policy, policy_names
+from baselines.run import run_policy
+from tlf_env.task.scenario import load_scenario
+
+SCENARIO = load_scenario(horizon_s=0.2)
+MODULE = """
+import numpy as np
+
+class Still:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2)), state
+
+class Odd:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 3)), state
+
+nothing = object
+"""
+
+
+@pytest.fixture
+def own_module(tmp_path, monkeypatch):
+    (tmp_path / "own_policies.py").write_text(MODULE)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.syspath_prepend(tmp_path)
+
+
+@pytest.mark.parametrize("name", [*policy_names(), "reference"])
+def test_every_name_makes_a_policy_that_drives(name):
+    record = run_policy(SCENARIO, make_policy(name, SCENARIO))
+    assert np.isfinite(record["x_mm"]).all()
+
+
+@pytest.mark.parametrize("name", ["", "no_such", "reference:no_such", "pure_pursuit:tuned"])
+def test_an_unknown_name_is_told(name):
+    with pytest.raises(ValueError, match=r"^[^\n]+$"):
+        make_policy(name, SCENARIO)
+
+
+@pytest.mark.parametrize("name", policy_names())
+@pytest.mark.parametrize("fields", [{"observation": "sensor"}, {"action": "wheel_speed"}])
+def test_a_policy_that_does_not_fit_is_told(name, fields):
+    with pytest.raises(ValueError, match="takes 'tracking' observations and gives 'twist'"):
+        make_policy(name, load_scenario(**fields))
+
+
+@pytest.mark.usefixtures("own_module")
+def test_a_policy_of_ones_own_comes_from_a_factory():
+    policy = make_policy("own_policies:Still", SCENARIO)
+    record = run_policy(SCENARIO, policy)
+    assert np.abs(np.diff(record["x_mm"], axis=0)).max() < 1e-6
+
+
+@pytest.mark.usefixtures("own_module")
+def test_a_policy_of_ones_own_must_predict_actions_of_the_right_shape():
+    with pytest.raises(ValueError, match=r"has no predict\(\)"):
+        make_policy("own_policies:nothing", SCENARIO)
+    with pytest.raises(ValueError, match=r"must have the shape \(3, 2\), got \(3, 3\)"):
+        run_policy(SCENARIO, make_policy("own_policies:Odd", SCENARIO))
+
+
+def test_a_zip_is_loaded_only_on_trust(tmp_path):
+    path = tmp_path / "model.zip"
+    path.write_bytes(b"no zip")
+    with pytest.raises(ValueError, match="--trust"):
+        make_policy(str(path), SCENARIO)
+    with pytest.raises(ValueError, match="no such file"):
+        make_policy(str(tmp_path / "none.zip"), SCENARIO, trust=True)
+
+
+@pytest.fixture(scope="module")
+def learner():
+    pytest.importorskip("stable_baselines3")
+    import gymnasium
+
+    import tlf_env  # noqa: F401  registers the environments
+
+    return gymnasium.make("tlf_env/Infinity-v0")
+
+
+@pytest.mark.parametrize("algorithm", ["PPO", "SAC", "TD3"])
+def test_a_model_of_stable_baselines_drives_every_robot(algorithm, learner, tmp_path):
+    import stable_baselines3
+
+    few = {"n_steps": 8, "batch_size": 8} if algorithm == "PPO" else {"buffer_size": 8}
+    net = {"net_arch": [4]}
+    model = getattr(stable_baselines3, algorithm)(
+        "MlpPolicy", learner, policy_kwargs=net, device="cpu", seed=0, **few
+    )
+    path = tmp_path / "model.zip"
+    model.save(path)
+    policy = make_policy(str(path), SCENARIO, trust=True)
+    seen = np.zeros((3, *learner.observation_space.shape), dtype=np.float32)
+    found = policy.predict(seen, deterministic=True)[0]
+    np.testing.assert_array_equal(found, model.predict(seen, deterministic=True)[0])
+    run_policy(SCENARIO, policy)
+    with pytest.raises(ValueError, match="its observation has the shape"):
+        make_policy(str(path), load_scenario(preview_s=(0.5,)), trust=True)
+
+
+@pytest.mark.usefixtures("learner")
+def test_a_zip_that_is_no_model_is_told(tmp_path):
+    path = tmp_path / "model.zip"
+    path.write_bytes(b"no zip")
+    with pytest.raises(ValueError, match=r"model\.zip"):
+        make_policy(str(path), SCENARIO, trust=True)
