@@ -103,7 +103,7 @@ def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
 def _algorithm_of(data: dict[str, object], path: Path) -> str:
     for key, algorithm in (
         ("clip_range", "PPO"),
-        ("ent_coef_optimizer", "SAC"),
+        ("target_entropy", "SAC"),
         ("policy_delay", "TD3"),
     ):
         if key in data:

@@ -8,7 +8,7 @@ import numpy as np
 
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.tracking import Gains, TrackingGains, gains_row, tracking_gains
-from tlf_env.task.actions import ACTION_SIZE, reference_action
+from tlf_env.task.actions import ACTION_SIZE, limited, reference_action
 from tlf_env.task.observation import TRACKING_ENTRIES, Tracking
 
 SCALES = np.array([entry.scale for entry in TRACKING_ENTRIES.values()])
@@ -17,7 +17,8 @@ SCALES = np.array([entry.scale for entry in TRACKING_ENTRIES.values()])
 @driver
 def _actions(rows: np.ndarray, scales: np.ndarray, gains: Gains, out: np.ndarray) -> None:
     for i in range(rows.shape[0]):
-        out[i, 0], out[i, 1] = reference_action(rows[i], scales, gains)
+        a_0, a_1 = reference_action(rows[i], scales, gains)
+        out[i, 0], out[i, 1] = limited(a_0), limited(a_1)
 
 
 class ReferencePolicy:

@@ -69,6 +69,9 @@ class Run(NamedTuple):
     motion: Motion
     contact: Contact
 
+    def last(self) -> tuple[Motion, Contact]:
+        return self.at(-1)
+
     def at(self, k: int) -> tuple[Motion, Contact]:
         return Motion(*(row[k] for row in self.motion)), Contact(*(row[k] for row in self.contact))
 

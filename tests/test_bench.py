@@ -247,7 +247,7 @@ def test_a_sweep_runs_every_value():
 
 def test_a_swept_bench_tells_where_policies_break(tmp_path):
     plan = Plan(
-        ("reference:consistent",), ("infinity",), ("nominal",), (0, 2), overrides=SHORT,
+        ("reference:consistent",), ("infinity",), ("nominal",), (0, 2), overrides=(("horizon_s", 20.0),),
         sweep="slip.delta_1_mm_s", sweep_values=(0.0, 2000.0),
     )  # fmt: skip
     board = leaderboard(run_bench(plan, tmp_path))
@@ -316,7 +316,7 @@ def test_bad_input_is_one_line_and_writes_nothing(words, said, tmp_path, monkeyp
         main()
     assert end.value.code == 2
     told = capsys.readouterr().err
-    assert told.count("\n") == 1
+    assert "\n" not in told.strip()
     assert said in told
     assert not list((tmp_path / "out").glob("*"))
 

@@ -63,7 +63,7 @@ def test_infinity_and_flower_are_the_papers():
         assert scenario.observer.smoothing_s == 5
         assert scenario.ekf.fix_variance_mm2 == 0.2
         assert scenario.lost_beyond_mm == 1200
-        assert scenario.disturbance.position.noise_std_mm**2 == pytest.approx(0.2)
+        assert scenario.disturbance.position.noise_std_mm.value**2 == pytest.approx(0.2)
 
 
 def test_robot_is_that_of_table_1():

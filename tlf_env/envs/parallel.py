@@ -29,6 +29,7 @@ from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
 Agent = str
 Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
 RENDER_MODES = ["human", "rgb_array"]
+FARTHEST_START_MM = 1e9
 PETTINGZOO_TEST_OPTION = "options"  # what PettingZoo's own API test passes; means nothing
 
 
@@ -333,7 +334,11 @@ def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | No
     if unknown:
         raise ValueError(f"reset option {unknown[0]!r} is unknown; there are poses, phase_s")
     phase_s = options.get("phase_s", 0.0)
-    if not isinstance(phase_s, Real) or not np.isfinite(float(phase_s)):
+    if (
+        isinstance(phase_s, bool)
+        or not isinstance(phase_s, Real)
+        or not np.isfinite(float(phase_s))
+    ):
         raise ValueError(
             f"reset option phase_s must be a finite number of seconds, got {phase_s!r}"
         )
@@ -343,9 +348,9 @@ def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | No
         poses = np.asarray(options["poses"], dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise ValueError(f"reset option poses must be numbers: {error}") from error
-    if poses.shape != (robots, 3) or not np.isfinite(poses).all():
+    if poses.shape != (robots, 3) or not (np.abs(poses) <= FARTHEST_START_MM).all():
         raise ValueError(
-            f"reset option poses must be {robots} finite rows (x mm, y mm, θ rad), "
+            f"reset option poses must be {robots} rows (x mm, y mm, θ rad) within ±{FARTHEST_START_MM:g}, "
             f"got the shape {poses.shape}: {options['poses']!r}"
         )
     return poses, float(phase_s)

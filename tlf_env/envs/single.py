@@ -75,7 +75,8 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> None:
         self.formation_env = FormationParallelEnv(scenario, render_mode=render_mode, **overrides)
         agents = self.formation_env.possible_agents
-        learner = learner or agents[min(1, len(agents) - 1)]
+        if learner is None:
+            learner = agents[min(1, len(agents) - 1)]
         if learner not in agents:
             raise ValueError(f"learner {learner!r} is not one of {', '.join(agents)}")
         self.learner = learner
@@ -104,7 +105,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
                     f"others {others!r} is neither {BY_REFERENCE!r} nor 'module:factory' nor an object"
                 )
             driver = load_part(others)()
-        if not hasattr(driver, "predict"):
+        if isinstance(driver, type) or not hasattr(driver, "predict"):
             raise ValueError(f"others {driver!r} has no predict()")
         return cast(Predicts, driver)
 

@@ -55,7 +55,7 @@ def cache_folder() -> Path:
             return folder
     except OSError:
         folder = _temporary_folder() / sources_digest()
-        folder.mkdir(exist_ok=True)
+        folder.mkdir(mode=0o700, exist_ok=True)
         return folder
 
 

@@ -2,19 +2,47 @@
 
 from __future__ import annotations
 
+import re
+from typing import Any
+
 from pydantic import ValidationError
+
+# Parts of a place that name a branch of a union, not a key of the user's.
+BRANCH = re.compile(r"[A-Z]\w*|(literal|constrained|tuple|function)[-\[].*|int|str")
 
 
 def one_line(error: ValidationError) -> str:
     """A validation error as one line: every place, what is wrong there, and the value."""
-    parts = []
-    for item in error.errors():
-        place = ".".join(str(part) for part in item["loc"])
-        message = item["msg"].removeprefix("Value error, ")
-        value = item["input"]
-        if item["type"] == "extra_forbidden":
-            message = "unknown key"
-        elif item["type"] != "value_error" and not isinstance(value, dict | list):
-            message += f", got {value!r}"
-        parts.append(f"{place}: {message}" if place else message)
-    return "; ".join(parts)
+    return "; ".join(dict.fromkeys(_told(item) for item in _relevant(error.errors())))
+
+
+def _place(item: Any) -> tuple[str, ...]:
+    return tuple(str(part) for part in item["loc"] if not BRANCH.fullmatch(str(part)))
+
+
+def _relevant(items: list[Any]) -> list[Any]:
+    """Where a union refused a value, only the branch that the value was meant for."""
+    kept = []
+    for item in items:
+        wrong_kind = item["type"].endswith("_type")
+        key = item["loc"][:1]
+        others = [
+            other
+            for other in items
+            if other["loc"][:1] == key and other is not item and not other["type"].endswith("_type")
+        ]
+        in_branch = any(BRANCH.fullmatch(str(part)) for part in item["loc"])
+        if not (wrong_kind and in_branch and others):
+            kept.append(item)
+    return kept
+
+
+def _told(item: Any) -> str:
+    place = ".".join(_place(item))
+    message = item["msg"].removeprefix("Value error, ")
+    value = item["input"]
+    if item["type"] == "extra_forbidden":
+        message = "unknown key"
+    elif item["type"] != "value_error" and not isinstance(value, dict | list):
+        message += f", got {value!r}"
+    return f"{place}: {message}" if place else message

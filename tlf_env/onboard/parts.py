@@ -17,7 +17,7 @@ import numpy as np
 
 from tlf_env.onboard.observer import Message, Reference
 
-PART_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_][\w.]*$"
+PART_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_<][\w.<>]*$"  # <locals>, <lambda>: given as objects
 Factory = Callable[..., Any]
 
 
@@ -96,7 +96,10 @@ def finite(value: Any, size: int, what: str) -> np.ndarray:
     ValueError
         naming the part, if the shape is wrong or a number is not finite.
     """
-    array = np.asarray(value, dtype=np.float64)
+    try:
+        array = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        array = np.empty(0)
     if array.shape != (size,) or not np.isfinite(array).all():
         raise ValueError(f"{what} must return {size} finite numbers, got {value!r}")
     return array

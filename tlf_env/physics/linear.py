@@ -58,16 +58,22 @@ class LinearPlant(NamedTuple):
 
 
 def _rolling_motion(b: Body, forward: float, yaw: float, castor: float) -> Motion:
-    """The motion with all wheels rolling at a state, at the origin, heading 0."""
+    """The motion with all wheels rolling at a state, at the origin, heading 0.
+
+    As the substep before would have left it: rolling in its own frames, which lie half a substep back.
+    """
     pivot = b.d + b.q
-    sin, cos = math.sin(castor), math.cos(castor)
+    fork_rate = -(pivot * yaw * math.cos(castor) + forward * math.sin(castor)) / b.T
+    before = castor - 0.5 * STEP_S * (fork_rate - yaw)
+    sin, cos = math.sin(before), math.cos(before)
+    back = -0.5 * STEP_S * yaw
     return Motion(
         x=0.0,
         y=0.0,
         theta=0.0,
         psi=castor,
-        v_x=yaw * b.d,
-        v_y=forward,
+        v_x=yaw * b.d * math.cos(back) - forward * math.sin(back),
+        v_y=yaw * b.d * math.sin(back) + forward * math.cos(back),
         w=yaw,
         s=-(pivot * yaw * cos + forward * sin) / b.T,
         omega_l=(forward - yaw * b.h) / b.R,

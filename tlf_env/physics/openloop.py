@@ -187,7 +187,9 @@ def run_open_loop(
         update={"joint_friction": scenario.joint_friction}
     )
     if not (math.isfinite(dt_s) and dt_s > 0):
-        raise ValueError(f"dt_s {dt_s} must be above 0")
+        raise ValueError(
+            f"dt_s {dt_s} must divide the {ROW_EVERY_S} s between rows, and be above 0"
+        )
     if scenario.duration_s / dt_s > MAX_STEPS:
         raise ValueError(
             f"dt_s {dt_s} makes more than {MAX_STEPS} steps of {scenario.duration_s} s"

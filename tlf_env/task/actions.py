@@ -54,12 +54,18 @@ U_2 = Tracking._fields.index("reference_u_2")
 
 
 @law
+def limited(a: float) -> float:
+    """An action's component within [−1, 1]."""
+    return min(max(a, -1.0), 1.0)
+
+
+@law
 def reference_action(
     observation: np.ndarray, scales: np.ndarray, gains: Gains
 ) -> tuple[float, float]:
-    """The tracking law, eqs (16)–(21), as a ``twist`` action, from one ``tracking`` observation.
+    """The tracking law, eqs (16)–(21), in units of a ``twist`` action, from one ``tracking`` observation.
 
-    Within [−1, 1].
+    Not limited yet: a residual is added before.
     """
     u_1, u_2 = tracking_twist(
         observation[E_1] * scales[E_1],
@@ -70,9 +76,7 @@ def reference_action(
         observation[U_2] * scales[U_2],
         gains,
     )
-    a_0 = min(max(u_1 / FULL_SPEED_MM_S, -1.0), 1.0)
-    a_1 = min(max(u_2 / FULL_YAW_RATE_RAD_S, -1.0), 1.0)
-    return a_0, a_1
+    return u_1 / FULL_SPEED_MM_S, u_2 / FULL_YAW_RATE_RAD_S
 
 
 @law

@@ -127,7 +127,7 @@ class Disturbance(Frozen):
                 value = leveled(channel.nominal, end, self.level)
                 if not channel.low <= value <= channel.high:
                     raise ValueError(
-                        f"{channel.path} reaches {value:g} at level {self.level:g}; "
+                        f"{channel.path} reaches {float(f'{value:.6g}')} at level {self.level}; "
                         f"allowed is {channel.low:g} to {channel.high:g}"
                     )
         for patch in self.tyre.patches:

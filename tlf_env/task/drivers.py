@@ -68,9 +68,10 @@ from tlf_env.task.actions import (
     REFERENCE,
     RESIDUAL,
     TORQUE,
+    TWIST,
+    limited,
     reference_action,
     wheel_command,
-    wheel_speeds,
 )
 from tlf_env.task.arrays import (
     Arrays,
@@ -155,11 +156,9 @@ def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
     if kind == RESIDUAL:
         base = a.base_actions[lane, r]
         base[0], base[1] = reference_action(a.observations[lane, r], a.scales, s.base)
-        return wheel_speeds(
-            base[0] * FULL_SPEED_MM_S + a_0 * FULL_RESIDUAL_MM_S,
-            base[1] * FULL_YAW_RATE_RAD_S + a_1 * FULL_RESIDUAL_RAD_S,
-            body,
-        )
+        b_0 = base[0] + a_0 * FULL_RESIDUAL_MM_S / FULL_SPEED_MM_S
+        b_1 = base[1] + a_1 * FULL_RESIDUAL_RAD_S / FULL_YAW_RATE_RAD_S
+        return wheel_command(limited(b_0), limited(b_1), TWIST, body)
     return wheel_command(a_0, a_1, kind, body)
 
 
@@ -348,9 +347,8 @@ def take_actions(a: Arrays, s: Settings) -> int:
             if a.kinds[r, lane] == REFERENCE:
                 base = a.base_actions[lane, r]
                 base[0], base[1] = reference_action(a.observations[lane, r], a.scales, s.base)
-                a.actions[lane, r, 0], a.actions[lane, r, 1] = base[0], base[1]
-            a_0 = min(max(a.actions[lane, r, 0], -1.0), 1.0)
-            a_1 = min(max(a.actions[lane, r, 1], -1.0), 1.0)
+                a.actions[lane, r, 0], a.actions[lane, r, 1] = limited(base[0]), limited(base[1])
+            a_0, a_1 = limited(a.actions[lane, r, 0]), limited(a.actions[lane, r, 1])
             clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]
             if clipped:
                 a.infos[lane, r, CLIPPED] += 1.0

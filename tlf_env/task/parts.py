@@ -103,5 +103,5 @@ class Parts:
         old = drivers.message_slot_of(a, r, m, s)
         message = Message(*a.messages[:, old, r - 1, 0].tolist())
         reference = self._made["observer"][r].update(message, m * s.period)
-        row = finite(tuple(reference), 5, f"robot_{r}: the observer's update()")
+        row = finite(reference, 5, f"robot_{r}: the observer's update()")
         a.references[:, m % a.references.shape[1], r, 0] = row

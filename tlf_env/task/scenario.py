@@ -6,7 +6,7 @@ import functools
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, NoReturn, Self
 
 import yaml
 from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
@@ -34,6 +34,21 @@ MAX_STEPS = 10_000_000
 
 EndReason = Literal["lost", "touched"]
 PartPath = Annotated[str, Field(pattern=PART_PATTERN)]
+
+
+class FrozenDict(dict[str, float]):
+    """A dictionary that refuses to change."""
+
+    def _refuse(self, *_: Any, **__: Any) -> NoReturn:
+        raise TypeError(
+            "a scenario never changes; make another one with load_scenario(scenario, ...)"
+        )
+
+    __setitem__ = __delitem__ = __ior__ = _refuse
+    update = pop = popitem = clear = setdefault = _refuse
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return FrozenDict, (dict(self),)
 
 
 def presets_folder() -> Path:
@@ -112,7 +127,9 @@ class Scenario(Frozen):
     observation: Literal["tracking", "sensor"] = "tracking"
     dtype: Literal["float32", "float64"] = "float32"  # of observations and actions
     preview_s: tuple[NonNegative, ...] = (0.5, 1.0)
-    reward: dict[str, FiniteFloat] = Field(default_factory=DEFAULT_WEIGHTS._asdict)
+    reward: dict[str, FiniteFloat] = Field(
+        default_factory=lambda: FrozenDict(DEFAULT_WEIGHTS._asdict())
+    )
     cooperative: bool = False  # every robot gets the formation's mean reward
     end_on: tuple[EndReason, ...] = ("lost", "touched")
     lost_beyond_mm: Positive = 1200.0
@@ -120,14 +137,18 @@ class Scenario(Frozen):
     @model_validator(mode="before")
     @classmethod
     def _different_robots(cls, data: Any) -> Any:
-        if isinstance(data, Mapping) and isinstance(data.get("robots"), list | tuple):
-            base = data.get("robot", {})
-            if isinstance(base, RobotParameters):
-                base = base.model_dump()
-            robots = [
-                _merged(base, one) if isinstance(one, Mapping) else one for one in data["robots"]
+        """Let a robot be told by what differs: from the defaults, and each one from ``robot``."""
+        if not isinstance(data, Mapping):
+            return data
+        base = data.get("robot", {})
+        if isinstance(base, Mapping):
+            base = _merged(RobotParameters().model_dump(), base)
+        data = {**data, "robot": base}
+        if isinstance(data.get("robots"), list | tuple):
+            known = base.model_dump() if isinstance(base, RobotParameters) else base
+            data["robots"] = [
+                _merged(known, one) if isinstance(one, Mapping) else one for one in data["robots"]
             ]
-            return {**data, "robots": robots}
         return data
 
     @field_validator("disturbance", mode="before")
@@ -147,6 +168,11 @@ class Scenario(Frozen):
             )
         return {**DEFAULT_WEIGHTS._asdict(), **value}
 
+    @field_validator("reward", mode="after")
+    @classmethod
+    def _frozen_weights(cls, value: dict[str, float]) -> dict[str, float]:
+        return FrozenDict(value)
+
     @model_validator(mode="after")
     def _check(self) -> Self:
         for name in ("control_period_s",):
@@ -161,6 +187,8 @@ class Scenario(Frozen):
                     f"{name} {getattr(self, name)} must be a multiple of control_period_s "
                     f"{self.control_period_s}"
                 )
+        if len(set(self.preview_s)) < len(self.preview_s):
+            raise ValueError(f"preview_s {self.preview_s} must not hold a time twice")
         for time_s in self.preview_s:
             if time_s and whole_steps(time_s, self.control_period_s) is None:
                 raise ValueError(
@@ -177,10 +205,10 @@ class Scenario(Frozen):
                 f"horizon_s {self.horizon_s} is more than {MAX_STEPS} steps of physics_period_s"
             )
         room_mm = 2 * max(robot.outline_radius_mm for robot in self.robot_models)
-        if self.robot_count > 1 and self.start_spacing_mm <= room_mm + START_MARGIN_MM:
+        if self.robot_count > 1 and self.start_spacing_mm < room_mm + START_MARGIN_MM:
             raise ValueError(
-                f"start_spacing_mm {self.start_spacing_mm} must be above {room_mm + START_MARGIN_MM:g}, or the "
-                "robots touch at the start"
+                f"start_spacing_mm {self.start_spacing_mm} must be at least the outlines' {room_mm:g} "
+                f"and {START_MARGIN_MM:g} more, or the robots touch at the start"
             )
         delay = self.disturbance.signal("actuator.computing_delay_s").reach()[1]
         if delay * self.disturbance.level > self.control_period_s:
