@@ -279,25 +279,24 @@ def bench(
         overrides=() if horizon_s is None else (("horizon_s", horizon_s),),
         trust=trust,
     )
-    folder = writable_folder(out)
     with progress_bar("bench") as update:
         results = run_bench(
             plan,
-            folder,
+            out,
             processes=processes or os.cpu_count() or 1,
             ray_address=ray,
             progress=update,
         )
     from baselines.aggregate import write_leaderboard
 
-    board = write_leaderboard(results, folder, "tlf " + " ".join(without_places(sys.argv[1:])))
+    board = write_leaderboard(results, out, "tlf " + " ".join(without_places(sys.argv[1:])))
     if figures:
-        draw_bench(board, folder)
+        draw_bench(board, out)
     if as_json:
         typer.echo(json.dumps(board, indent=1, allow_nan=False))
     else:
         screen.print(board_table(board))
-        screen.print(f"In {folder}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
+        screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
 
 
 PLACES = ("--out", "--processes", "--ray")
