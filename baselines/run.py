@@ -234,6 +234,7 @@ def summary(record: Record) -> dict[str, Any]:
         "scenario": record.scenario.model_dump(mode="json"),
         "seed": record.seed,
         "policy": record.policy,
+        "privileged": record.scenario.privileged,
         "settle_s": record.scenario.settle_s,
         "versions": versions(),
         "string": record.string()._asdict(),

@@ -20,6 +20,13 @@ from baselines.run import versions
 from tlf_env.envs.parallel import parallel_env
 
 ROBOTS = (3, 5)
+# Cost against the number of robots, on a wide circle where even twenty do not meet.
+SCALING = (1, 2, 10, 20)
+WIDE_CIRCLE = {
+    "name": "wide-circle",
+    "trajectory": {"type": "circle", "radius_mm": 5000, "speed_mm_s": 200},
+    "disturbance": "nominal",
+}
 PEER_CYCLES = 25  # simple_spread's own default episode
 
 
@@ -32,13 +39,13 @@ class Course:
     drive: Callable[[int], float]  # steps → seconds
 
 
-def formation_course(robots: int, steps: int) -> Course:
-    """The pymunk environment on ∞, 20 substeps a step, along a closed-loop run of the reference.
+def formation_course(robots: int, steps: int, scenario: Any = "infinity") -> Course:
+    """The pymunk environment, 20 substeps a step, along a closed-loop run of the reference.
 
     The reference's actions are recorded first and replayed while the clock runs, so that only the
     environment is timed, on the motion that it is made for.
     """
-    env = parallel_env("infinity", robots=robots, horizon_s=max(steps, 50) * 0.02)
+    env = parallel_env(scenario, robots=robots, horizon_s=max(steps, 50) * 0.02)
     policy = ReferencePolicy()
     observations, _ = env.reset(seed=0)
     recorded: list[dict[str, np.ndarray]] = []
@@ -54,7 +61,7 @@ def formation_course(robots: int, steps: int) -> Course:
             env.step(actions)
         return time.perf_counter() - start
 
-    return Course("tlf_env/infinity-v0", robots, drive)
+    return Course(f"tlf_env/{env.scenario.name}-v0", robots, drive)
 
 
 def peer_course(robots: int) -> Course | None:
@@ -93,7 +100,8 @@ def measure(
     -------
     dict
         ``machine``, ``versions``, ``results`` (env steps per second: median, minimum and maximum
-        over the repeats) and ``ratios`` (median over the repeats of ours to the peer's).
+        over the repeats), ``ratios`` (median over the repeats of ours to the peer's) and ``scaling``
+        (cost of a step against the number of robots).
 
     Raises
     ------
@@ -108,6 +116,7 @@ def measure(
         peer = peer_course(robots)
         if peer is not None:
             courses.append(peer)
+    courses += [formation_course(robots, steps, WIDE_CIRCLE) for robots in SCALING]
     rates: dict[tuple[str, int], list[float]] = {(c.name, c.robots): [] for c in courses}
     for course in courses:
         course.drive(min(steps, 50))
@@ -136,6 +145,18 @@ def measure(
             for (name, robots), values in rates.items()
         ],
         "ratios": _ratios(rates),
+        "scaling": [
+            {
+                "robots": robots,
+                "us_per_step": round(
+                    1e6 / statistics.median(rates["tlf_env/wide-circle-v0", robots]), 1
+                ),
+                "us_per_robot_step": round(
+                    1e6 / statistics.median(rates["tlf_env/wide-circle-v0", robots]) / robots, 1
+                ),
+            }
+            for robots in SCALING
+        ],
     }
 
 

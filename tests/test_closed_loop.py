@@ -190,3 +190,15 @@ def test_more_grip_loses_nothing():
     grip = {"position": {"noise_std_mm": 0.2**0.5}, "tyre": {"friction_scale": 1.5}}
     for seed in range(4):
         assert not drive("infinity", seed=seed, disturbance=grip, horizon_s=60.0).lost.any()
+
+
+@pytest.mark.slow
+def test_scattered_starts_lose_the_filter_and_not_the_law():
+    """Start poses off by 80 mm and 0.3 rad: lost with the filter, recovered with the true pose."""
+    scattered = {"start": {"position_std_mm": 80.0, "heading_std_rad": 0.3}}
+    off = {"disturbance": scattered, "robot": without_contact(), "horizon_s": 60.0}
+    filtered = [drive("infinity", seed=seed, **off) for seed in range(10)]
+    assert sum(run.lost.any() for run in filtered) >= 8
+    for seed in range(10):
+        run = drive("infinity", seed=seed, estimator="truth", **off)
+        assert run.rms_between(0.7).max() < 100

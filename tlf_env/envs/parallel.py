@@ -299,6 +299,10 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                 self._formation.arrays.table[:, :2],
                 mode=self.render_mode,
                 fps=self.metadata["render_fps"],
+                patches=[
+                    patch.model_dump(exclude={"friction_scale"}) | {"scale": patch.friction_scale}
+                    for patch in self.scenario.disturbance.tyre.patches
+                ],
             )
         return self._renderer.draw(scene_of(self._formation))
 
