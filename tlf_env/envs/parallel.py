@@ -354,7 +354,8 @@ def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | No
         raise ValueError(f"reset option poses must be numbers: {error}") from error
     if poses.shape != (robots, 3) or not (np.abs(poses) <= FARTHEST_START_MM).all():
         raise ValueError(
-            f"reset option poses must be {robots} finite rows (x mm, y mm, θ rad) within ±{FARTHEST_START_MM:g}, "
+            f"reset option poses must be {robots} finite rows (x mm, y mm, θ rad) "
+            f"within ±{FARTHEST_START_MM:g}, "
             f"got the shape {poses.shape}: {options['poses']!r}"
         )
     return poses, float(phase_s)
