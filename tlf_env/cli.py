@@ -115,6 +115,7 @@ def run(
     name = named_policy(policy, gains)
     driver = make_policy(name, chosen, trust=trust)
     folder = writable_folder(out or Path("results") / chosen.name)
+    warn_of_compiling()
     with progress_bar(f"{chosen.name}, {name}") as update:
         record = run_policy(chosen, driver, seed, name=name, progress=update)
     written = write_record(record, folder)
@@ -127,6 +128,14 @@ def run(
         return
     screen.print(metrics_table(record))
     screen.print(f"In {folder}: {', '.join(path.name for path in written)}", soft_wrap=True)
+
+
+def warn_of_compiling() -> None:
+    """Say why the first run on a machine takes its time."""
+    from tlf_env.numerics.compiled import cache_folder
+
+    if not any(cache_folder().rglob("*control_step*.nbi")):
+        notes.print("Compiling the step drivers, once on this machine: about a minute.")
 
 
 def named_policy(policy: str, gains: str | None) -> str:
@@ -226,6 +235,7 @@ def speed(
     """Environment steps per second as JSON, beside mpe2's simple_spread_v3 where it is installed."""
     from baselines.speed import measure
 
+    warn_of_compiling()
     with progress_bar("speed") as update:
         result = measure(steps, repeats, progress=update)
     typer.echo(json.dumps(result, indent=2))
