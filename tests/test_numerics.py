@@ -7,7 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import annotations
 import numpy as np
 import pytest
 from hypothesis import given, settings
