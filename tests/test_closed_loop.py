@@ -65,15 +65,23 @@ def test_flower_at_20_ms_for_more_seeds():
         assert run.rms_mm.max() <= 1.5
 
 
+# The target is every seed. A miss stands here as a miss: the bound is the same for it.
+SKIDS_WHILE_CATCHING_UP = pytest.mark.xfail(
+    strict=True,
+    reason="robot_2 skids while it catches up from rest and its filter, which assumes no slip, loses the heading",
+)
+
+
 @pytest.mark.slow
-def test_infinity_at_20_ms_holds_but_for_rare_draws_of_noise():
-    """Catching up from rest a follower may skid until its filter has lost the heading: 1 run of 160."""
-    runs = [drive("infinity", seed=seed) for seed in range(40)]
-    held = [run for run in runs if not run.lost.any()]
-    assert len(held) >= 38
-    for run in held:
-        assert_within(run, (2.7, 3.8, 5.3))
-        assert run.rms_mm.max() <= 8.0
+@pytest.mark.parametrize(
+    "seed",
+    [pytest.param(k, marks=SKIDS_WHILE_CATCHING_UP) if k == 15 else k for k in range(40)],
+)
+def test_infinity_at_20_ms_holds_for_every_seed(seed):
+    run = drive("infinity", seed=seed)
+    assert not run.lost.any()
+    assert_within(run, (2.7, 3.8, 5.3))
+    assert run.rms_mm.max() <= 8.0
 
 
 def test_leader_peaks_near_470_mm_while_it_catches_up():
