@@ -68,7 +68,7 @@ def test_flower_at_20_ms_for_more_seeds():
 # The target is every seed. A miss stands here as a miss: the bound is the same for it.
 SKIDS_WHILE_CATCHING_UP = pytest.mark.xfail(
     strict=True,
-    reason="robot_2 skids while it catches up from rest and its filter, which assumes no slip, loses the heading",
+    reason="robot_2 skids while it catches up, and its filter, which assumes no slip, loses the heading",
 )
 
 
