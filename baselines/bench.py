@@ -173,16 +173,23 @@ def scenario_hash(scenario: Scenario) -> str:
     return hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()[:12]
 
 
+def _git(*words: str) -> str:
+    """What git says of the checkout that this file lies in."""
+    here = Path(__file__).resolve().parent
+    done = subprocess.run(
+        ["git", *words], cwd=here, capture_output=True, text=True, timeout=10, check=True
+    )
+    return done.stdout.strip()
+
+
 def git_revision() -> str | None:
     """Revision of the source checkout that runs, with ``+`` if it has changes; None without git."""
-    here = Path(__file__).resolve().parent
     try:
-        options = {"cwd": here, "capture_output": True, "text": True, "timeout": 10, "check": True}
-        revision = subprocess.run(["git", "rev-parse", "HEAD"], **options).stdout.strip()  # type: ignore[call-overload]
-        changes = subprocess.run(["git", "status", "--porcelain", "-uno"], **options).stdout  # type: ignore[call-overload]
+        revision = _git("rev-parse", "HEAD")
+        changes = _git("status", "--porcelain", "-uno")
     except (OSError, subprocess.SubprocessError):
         return None
-    return revision + ("+" if changes.strip() else "")
+    return revision + ("+" if changes else "")
 
 
 def policy_hash(name: str, policy: Policy) -> str | None:
