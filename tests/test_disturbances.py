@@ -13,12 +13,13 @@ from baselines import ReferencePolicy
 from tlf_env.envs.parallel import parallel_env
 from tlf_env.onboard.parts import part_name
 from tlf_env.physics.parameters import RobotParameters
-from tlf_env.task import drivers
-from tlf_env.task.arrays import Sample
+from tlf_env.task.arrays import Info, Sample
 from tlf_env.task.channels import CHANNELS, NOMINAL_NOISE_MM, PATHS, STEP_CHANNELS, number
 from tlf_env.task.disturbance import Disturbance, loaded
-from tlf_env.task.formation import Formation, settings
+from tlf_env.task.formation import Formation
+from tlf_env.task.radio import message_slot
 from tlf_env.task.scenario import load_scenario, preset_names, presets_folder
+from tlf_env.task.settings import settings
 
 ROBOT = RobotParameters()
 FREE = {"joint_friction": False}  # wheels that turn without friction: the physics is closed form
@@ -106,7 +107,7 @@ class Run:
             setattr(self, name, np.array([row[name] for row in rows]))
 
     def of_info(self, name):
-        return self.info[:, :, drivers.Info._fields.index(name)]
+        return self.info[:, :, Info._fields.index(name)]
 
 
 def run(channels=None, seconds=3.0, level=1.0, actions=None, **overrides):
@@ -522,7 +523,7 @@ def ages(found, robot=1, count=2000):
     out = []
     for step in range(100, 100 + count):
         a.clock[0, 1] = step
-        slot = drivers.message_slot(a, 0, robot, step, s)
+        slot = message_slot(a, 0, robot, step, s)
         out.append((step - s.gap - slot) % slots)
     return np.array(out)
 

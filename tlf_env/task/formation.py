@@ -8,9 +8,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 import pymunk
 
-from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import Factory
-from tlf_env.onboard.tracking import gains_row, tracking_gains
 from tlf_env.physics.parameters import body
 from tlf_env.physics.pymunk_plant import PymunkPlant
 from tlf_env.physics.state import Motion
@@ -27,10 +25,12 @@ from tlf_env.task.channels import (
     START_POSITION,
     STEP_CHANNELS,
 )
-from tlf_env.task.disturbance import changes_within_episode, loaded_body
-from tlf_env.task.measures import TIME_GAP_WINDOW_S
+from tlf_env.task.disturbance import loaded_body
+from tlf_env.task.judging import BODY_D
+from tlf_env.task.outlines import BODY_AHEAD, BODY_OUTLINE
 from tlf_env.task.parts import Parts, part_factories
 from tlf_env.task.scenario import START_MARGIN_MM, Scenario
+from tlf_env.task.settings import settings
 from tlf_env.task.trajectories import sample
 
 
@@ -172,7 +172,7 @@ class Formation:
         return self.arrays.applied[:, :, 0].T
 
     def _place(self, r: int, x_mm: float, y_mm: float, theta: float) -> None:
-        a, d = self.arrays, self.arrays.bodies[drivers.BODY_D, r, 0]
+        a, d = self.arrays, self.arrays.bodies[BODY_D, r, 0]
         a.motions[:4, r, 0] = x_mm + d * np.sin(theta), y_mm - d * np.cos(theta), theta, theta
         a.estimates[:3, r, 0] = x_mm, y_mm, theta
         a.observers[:, r, 0] = x_mm, y_mm, theta
@@ -219,32 +219,6 @@ class Formation:
     def state(self) -> np.ndarray:
         """The truth, (robot, :class:`State`), in physical units."""
         return state_rows(self.arrays)
-
-
-def settings(scenario: Scenario) -> drivers.Settings:
-    """The scenario's numbers as the drivers take them."""
-    observer = scenario.observer
-    paper = observer if isinstance(observer, ObserverParameters) else ObserverParameters()
-    kinds = {"ekf": drivers.EKF, "truth": drivers.TRUTH}
-    return drivers.Settings(
-        kinematic=scenario.plant == "kinematic",
-        substeps=scenario.substeps,
-        dt=scenario.physics_period_s,
-        period=scenario.control_period_s,
-        gap=scenario.gap_steps,
-        lookahead=max(scenario.preview_steps, default=0),
-        window=round(TIME_GAP_WINDOW_S / scenario.control_period_s),
-        observer_gain=paper.gain_per_s,
-        smoothing=paper.smoothing_s,
-        lost_beyond=scenario.lost_beyond_mm,
-        estimator=kinds.get(scenario.estimator, drivers.EXTERNAL),
-        external_wheel_loop=isinstance(scenario.wheel_loop, str),
-        external_observer=isinstance(observer, str),
-        cooperative=scenario.cooperative,
-        changing=changes_within_episode(scenario.disturbance),
-        adversary=scenario.adversary,
-        base=gains_row(tracking_gains(scenario.residual_base)),
-    )
 
 
 def start_poses(scenario: Scenario, first: Sequence[float] | np.ndarray) -> np.ndarray:
@@ -295,10 +269,10 @@ def _apart(a: Arrays, poses: np.ndarray, i: int, j: int) -> bool:
     """Whether two robots' outlines are apart at given poses of c."""
     centres, room = [], 0.0
     for r in (i, j):
-        ahead = a.bodies[drivers.BODY_AHEAD, r, 0] - a.bodies[drivers.BODY_D, r, 0]
+        ahead = a.bodies[BODY_AHEAD, r, 0] - a.bodies[BODY_D, r, 0]
         x_mm, y_mm, theta = poses[r]
         centres.append((x_mm - ahead * np.sin(theta), y_mm + ahead * np.cos(theta)))
-        room += a.bodies[drivers.BODY_OUTLINE, r, 0]
+        room += a.bodies[BODY_OUTLINE, r, 0]
     (x_i, y_i), (x_j, y_j) = centres
     return math.hypot(x_i - x_j, y_i - y_j) > room + START_MARGIN_MM
 
@@ -306,7 +280,7 @@ def _apart(a: Arrays, poses: np.ndarray, i: int, j: int) -> bool:
 def state_rows(a: Arrays) -> np.ndarray:
     """True state of lane 0, (robot, :class:`State`)."""
     m = Motion(*a.motions[:, :, 0])
-    d = a.bodies[drivers.BODY_D, :, 0]
+    d = a.bodies[BODY_D, :, 0]
     sin, cos = np.sin(m.theta), np.cos(m.theta)
     slot = a.clock[0, 1] % a.references.shape[1]
     rows = [

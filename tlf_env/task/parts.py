@@ -12,6 +12,7 @@ from tlf_env.task import drivers
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.arrays import Arrays, Sample, Sensors
 from tlf_env.task.scenario import Scenario
+from tlf_env.task.settings import Settings
 
 SPEEDS = [Sensors._fields.index("speed_l"), Sensors._fields.index("speed_r")]
 STEPS = [Sample._fields.index("step_l"), Sample._fields.index("step_r")]
@@ -55,7 +56,7 @@ class Parts:
     def __bool__(self) -> bool:
         return bool(self._factories)
 
-    def reset(self, a: Arrays, s: drivers.Settings) -> None:
+    def reset(self, a: Arrays, s: Settings) -> None:
         """Make all parts anew and start them; observers run ahead by the preview."""
         self._made = {
             role: [factory(robot, self._periods[role]) for robot in self._robots]
@@ -74,7 +75,7 @@ class Parts:
     def _of(self, role: str) -> list[Any]:
         return self._made.get(role, [])
 
-    def drive(self, a: Arrays, k: int, s: drivers.Settings) -> None:
+    def drive(self, a: Arrays, k: int, s: Settings) -> None:
         """Wheel loops: put torques in the place of the commands that :attr:`Arrays.wanted` keeps."""
         for r, loop in enumerate(self._of("wheel_loop")):
             if a.kinds[r, 0] == TORQUE:
@@ -94,12 +95,12 @@ class Parts:
             pose = estimator.update(sample[STEPS], sample[FIXES])
             a.estimates[:3, r, 0] = finite(pose, 3, f"robot_{r}: the estimator's update()")
 
-    def observe(self, a: Arrays, s: drivers.Settings) -> None:
+    def observe(self, a: Arrays, s: Settings) -> None:
         """Observers: the followers' next references."""
         for r in range(1, len(self._robots)):
             self._observe_one(a, s, r, int(a.clock[0, 1]) + s.lookahead)
 
-    def _observe_one(self, a: Arrays, s: drivers.Settings, r: int, m: int) -> None:
+    def _observe_one(self, a: Arrays, s: Settings, r: int, m: int) -> None:
         old = drivers.message_slot_of(a, r, m, s)
         message = Message(*a.messages[:, old, r - 1, 0].tolist())
         reference = self._made["observer"][r].update(message, m * s.period)

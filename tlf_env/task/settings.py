@@ -1,0 +1,61 @@
+"""What the drivers know of a scenario, as plain numbers."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+from tlf_env.onboard.observer import ObserverParameters
+from tlf_env.onboard.tracking import Gains, gains_row, tracking_gains
+from tlf_env.task.disturbance import changes_within_episode
+from tlf_env.task.measures import TIME_GAP_WINDOW_S
+from tlf_env.task.scenario import Scenario
+
+EKF, TRUTH, EXTERNAL = range(3)
+
+
+class Settings(NamedTuple):
+    """Numbers of a scenario that all robots share."""
+
+    kinematic: bool
+    substeps: int
+    dt: float  # physics period, s
+    period: float  # control period, s
+    gap: int  # control steps of the time gap
+    lookahead: int  # control steps of the longest preview
+    window: int  # control steps around one gap ago in which the time gap is measured
+    observer_gain: float  # 1/s
+    smoothing: float  # s
+    lost_beyond: float  # mm
+    estimator: int  # EKF, TRUTH or EXTERNAL
+    external_wheel_loop: bool
+    external_observer: bool
+    cooperative: bool  # every robot gets the formation's mean reward
+    changing: bool  # whether a channel of every substep varies within an episode
+    adversary: bool
+    base: Gains  # of the twist that a residual is added to
+
+
+def settings(scenario: Scenario) -> Settings:
+    """The scenario's numbers as the drivers take them."""
+    observer = scenario.observer
+    paper = observer if isinstance(observer, ObserverParameters) else ObserverParameters()
+    kinds = {"ekf": EKF, "truth": TRUTH}
+    return Settings(
+        kinematic=scenario.plant == "kinematic",
+        substeps=scenario.substeps,
+        dt=scenario.physics_period_s,
+        period=scenario.control_period_s,
+        gap=scenario.gap_steps,
+        lookahead=max(scenario.preview_steps, default=0),
+        window=round(TIME_GAP_WINDOW_S / scenario.control_period_s),
+        observer_gain=paper.gain_per_s,
+        smoothing=paper.smoothing_s,
+        lost_beyond=scenario.lost_beyond_mm,
+        estimator=kinds.get(scenario.estimator, EXTERNAL),
+        external_wheel_loop=isinstance(scenario.wheel_loop, str),
+        external_observer=isinstance(observer, str),
+        cooperative=scenario.cooperative,
+        changing=changes_within_episode(scenario.disturbance),
+        adversary=scenario.adversary,
+        base=gains_row(tracking_gains(scenario.residual_base)),
+    )
