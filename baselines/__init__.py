@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from baselines.learned import load_policy
 from baselines.reference import ReferencePolicy
 
-__all__ = ["ReferencePolicy"]
+__all__ = ["ReferencePolicy", "load_policy"]

@@ -140,6 +140,7 @@ def leaderboard(results: Results) -> dict[str, Any]:
             "disturbance": stratum[1],
             "sweep": stratum[2],
             "privileged": lines[0]["privileged"],
+            "overrides": lines[0].get("overrides", {}),
             **cell_table(lines),
         }
         for policy, strata in groups.items()
@@ -183,6 +184,12 @@ def policy_table(
     return {
         "policy": policy,
         "privileged": any(line["privileged"] for lines in strata.values() for line in lines),
+        "overrides": {
+            field: value
+            for lines in strata.values()
+            for line in lines
+            for field, value in line.get("overrides", {}).items()
+        },
         "runs": len(failed),
         "failed": sum(failed),
         "score": {"iqm": own, "interval": stratified_interval(scores, pooled_iqm)},
@@ -333,8 +340,13 @@ def task_tables(board: dict[str, Any], task: str) -> list[str]:
 
 
 def title(row: dict[str, Any]) -> str:
-    """A policy's name, marked if it is given the truth."""
-    return row["policy"] + (" (privileged)" if row["privileged"] else "")
+    """A policy's name, with what it has otherwise than the scenario, and marked if given the truth."""
+    marks = [
+        f"{field} {', '.join(map(str, value)) if isinstance(value, list) else value}"
+        for field, value in row.get("overrides", {}).items()
+    ]
+    marks += ["privileged"] if row["privileged"] else []
+    return row["policy"] + (f" ({'; '.join(marks)})" if marks else "")
 
 
 def span(ends: Sequence[float] | None, digits: int) -> str:

@@ -22,7 +22,8 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from baselines.policies import make_policy
+from baselines.learned import LearnedPolicy
+from baselines.policies import enter
 from baselines.run import Policy, run_policy, versions
 from tlf_env.envs.parallel import checked_seed
 from tlf_env.numerics.compiled import sources_digest
@@ -155,13 +156,16 @@ def disturbance_presets() -> list[str]:
 
 
 def run_cell(plan: Plan, cell: Cell) -> dict[str, Any]:
-    """Run one episode; the line that it adds to ``runs.jsonl``."""
-    scenario = plan.scenario(cell)
-    policy = make_policy(cell.policy, scenario, trust=plan.trust)
+    """Run one episode; the line that it adds to ``runs.jsonl``.
+
+    The scenario is the plan's with what the policy asks for: what it sees, acts on and runs on board.
+    """
+    policy, scenario, overrides = enter(cell.policy, plan.scenario(cell), trust=plan.trust)
     record = run_policy(scenario, policy, cell.seed, name=cell.policy)
     return {
         **cell._asdict(),
         "scenario_hash": scenario_hash(scenario),
+        "overrides": overrides,
         "privileged": scenario.privileged or bool(getattr(policy, "privileged", False)),
         "string": record.string()._asdict(),
         "robots": [metrics._asdict() for metrics in record.metrics()],
@@ -193,12 +197,22 @@ def git_revision() -> str | None:
 
 
 def policy_hash(name: str, policy: Policy) -> str | None:
-    """Twelve digits of the file that a policy comes from; None if there is none."""
+    """Twelve digits of the files that a policy comes from; None if there are none."""
+    files = [Path(name)] if name.endswith(".zip") else _sources(policy)
+    if not files:
+        return None
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+
+
+def _sources(policy: Policy) -> list[Path]:
+    """A learned policy's weights and card, or the file that defines the object's class."""
+    if isinstance(policy, LearnedPolicy):
+        return list(policy.files)
     try:
-        source = name if name.endswith(".zip") else inspect.getsourcefile(type(policy))
+        source = inspect.getsourcefile(type(policy))
     except TypeError:
-        source = None
-    return hashlib.sha256(Path(source).read_bytes()).hexdigest()[:12] if source else None
+        return []
+    return [Path(source)] if source else []
 
 
 def plan_record(plan: Plan) -> dict[str, Any]:
@@ -222,7 +236,7 @@ def plan_record(plan: Plan) -> dict[str, Any]:
                 scenario = plan.scenario(cell)
                 scenarios[place] = scenario_hash(scenario)
         for name in plan.policies:
-            policies[name] = policy_hash(name, make_policy(name, scenario, trust=plan.trust))
+            policies[name] = policy_hash(name, enter(name, scenario, trust=plan.trust).policy)
     asked = asdict(plan)
     del asked["trust"]  # a permission, which changes no result
     return {

@@ -2,22 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
+from typing import Any, NamedTuple
 
+from baselines.card import WEIGHTS
 from baselines.classical import FeedbackLinearisation, PurePursuit
+from baselines.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.reference import ReferencePolicy
 from baselines.run import Policy
 from tlf_env.onboard.parts import load_part
 from tlf_env.onboard.tracking import GAIN_PRESETS
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import tracking_entries
-from tlf_env.task.scenario import Scenario
+from tlf_env.task.scenario import Scenario, load_scenario
 
 CLASSICAL = {"pure_pursuit": PurePursuit, "feedback_linearisation": FeedbackLinearisation}
 
 
+# What a policy may ask of a scenario: what it sees, what it acts on, and what runs on board. Nothing
+# that changes the task or the disturbance, which are the same for everybody.
+OVERRIDABLE = ("action", "observation", "residual_base", "estimator", "preview_s")
+
+
+class Entry(NamedTuple):
+    """A policy, and the scenario as it needs it."""
+
+    policy: Policy
+    scenario: Scenario
+    overrides: dict[str, Any]  # fields that differ from the scenario given; a list for a tuple
+
+
 def policy_names() -> list[str]:
-    """The names that need no file."""
+    """The names of the policies that are not learned; they need no file."""
     return [*(f"reference:{gains}" for gains in GAIN_PRESETS), *CLASSICAL]
 
 
@@ -27,7 +44,8 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     Parameters
     ----------
     name
-        ``reference`` or ``reference:GAINS``, ``pure_pursuit``, ``feedback_linearisation``,
+        ``reference`` or ``reference:GAINS``, ``pure_pursuit``, ``feedback_linearisation``, the name
+        of a shipped learned policy, the path of a ``.safetensors`` with its card beside it,
         ``module:factory`` of an object with SB3's ``predict``, or the path of an SB3 ``.zip``.
     trust
         Allow an SB3 ``.zip``: loading one runs code that is in it.
@@ -35,11 +53,70 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     Raises
     ------
     ValueError
-        for an unknown name, a file that cannot be read, an untrusted ``.zip``, or a policy whose
-        spaces do not fit the scenario.
+        for an unknown name, a file that cannot be read, an untrusted ``.zip``, or a policy that does
+        not fit the scenario.
     """
+    policy = _made(name, scenario, trust=trust)
+    if isinstance(policy, LearnedPolicy):
+        policy.check_fit(name, scenario)
+    return policy
+
+
+def enter(name: str, scenario: Scenario, *, trust: bool = False) -> Entry:
+    """A policy, and the scenario with what the policy asks for in ``scenario_overrides``.
+
+    That attribute maps fields of :data:`OVERRIDABLE` to values; a learned policy has it from its
+    card. A field that the scenario's file or the caller has set stands as it is set.
+
+    Parameters
+    ----------
+    name, trust
+        As for :func:`make_policy`.
+
+    Raises
+    ------
+    ValueError
+        as for :func:`make_policy`, and if a policy asks for a field that it may not, or a value that
+        there is not.
+    """
+    policy = _made(name, scenario, trust=trust)
+    asked = _asked(name, policy, scenario)
+    if asked:
+        try:
+            fitted = load_scenario(scenario, **asked)
+        except ValueError as error:
+            raise ValueError(f"policy {name!r} asks of the scenario: {error}") from error
+        differing = {
+            field: getattr(fitted, field)
+            for field in asked
+            if getattr(fitted, field) != getattr(scenario, field)
+        }
+        asked = {
+            field: list(value) if isinstance(value, tuple) else value
+            for field, value in differing.items()
+        }
+        scenario = fitted if asked else scenario
+    if isinstance(policy, LearnedPolicy):
+        policy.check_fit(name, scenario)
+    return Entry(policy, scenario, asked)
+
+
+def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
+    """What a policy asks for and nobody has set."""
+    asked = getattr(policy, "scenario_overrides", {})
+    if not isinstance(asked, Mapping) or set(asked) - set(OVERRIDABLE):
+        raise ValueError(
+            f"policy {name!r}: scenario_overrides must map fields of {', '.join(OVERRIDABLE)}; "
+            f"got {asked!r}"
+        )
+    return {field: asked[field] for field in asked if field not in scenario.model_fields_set}
+
+
+def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     if name.endswith(".zip"):
         return _stable_baselines(Path(name), scenario, trust=trust)
+    if name.endswith(WEIGHTS) or name in shipped_policies():
+        return load_policy(name)
     head, _, tail = name.partition(":")
     if head == "reference":
         fits(name, scenario, action="twist", observation="tracking")
@@ -52,8 +129,9 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
         if not hasattr(policy, "predict"):
             raise ValueError(f"policy {name!r} has no predict()")
         return policy
+    names = ", ".join([*policy_names(), *shipped_policies()])
     raise ValueError(
-        f"policy {name!r} is not one of {', '.join(policy_names())}, module:factory, FILE.zip"
+        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, FILE.zip"
     )
 
 

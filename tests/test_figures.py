@@ -177,7 +177,8 @@ def test_texts_stay_clear_of_the_axes_and_of_each_other(kind: str, name: str) ->
     figure = drawn(figures.FIGURES[name](run))
     whole = figure.bbox
     panels = [axes.get_window_extent() for axes in figure.axes]
-    for text in (figure.legends[0], figure._suptitle):  # type: ignore[attr-defined]
+    title = next(text for text in figure.texts if text.get_text() == figure.get_suptitle())
+    for text in (figure.legends[0], title):
         box = text.get_window_extent()
         assert whole.x0 <= box.x0 < box.x1 <= whole.x1
         assert whole.y0 <= box.y0 < box.y1 <= whole.y1

@@ -384,7 +384,7 @@ def test_what_the_page_shows_runs(monkeypatch: pytest.MonkeyPatch) -> None:
     page = (root / "docs" / "parts.md").read_text(encoding="utf-8")
     monkeypatch.syspath_prepend(root / "examples")
     shown = ModuleType("my_policies")
-    shown.np, shown.gymnasium = np, gymnasium  # type: ignore[attr-defined]
+    vars(shown).update(np=np, gymnasium=gymnasium)
     monkeypatch.setitem(sys.modules, shown.__name__, shown)
     for code in re.findall(r"^```python\n(.*?)^```", page, re.DOTALL | re.MULTILINE):
         exec(code, vars(shown))

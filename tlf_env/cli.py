@@ -63,7 +63,8 @@ def run(
     policy: Annotated[
         str,
         typer.Option(
-            help="reference[:GAINS], pure_pursuit, feedback_linearisation, module:factory, FILE.zip."
+            help="reference[:GAINS], pure_pursuit, feedback_linearisation, a shipped learned policy, "
+            "FILE.safetensors (with FILE.json), module:factory, FILE.zip (with --trust)."
         ),
     ] = "reference",
     gains: Annotated[
@@ -92,7 +93,7 @@ def run(
     ] = False,
 ) -> None:
     """Drive a policy through a scenario to the horizon; a table, a summary, data and figures."""
-    from baselines.policies import make_policy
+    from baselines.policies import enter
     from baselines.run import run_policy, summary, write_mat, write_record
     from tlf_env.envs.parallel import checked_seed
     from tlf_env.task.scenario import load_scenario, scenario_warnings
@@ -113,7 +114,10 @@ def run(
         notes.print(f"tlf: note: {line}", markup=False, soft_wrap=True)
     checked_seed(seed)
     name = named_policy(policy, gains)
-    driver = make_policy(name, chosen, trust=trust)
+    driver, chosen, overrides = enter(name, chosen, trust=trust)
+    if overrides:
+        told = ", ".join(f"{field} {value}" for field, value in overrides.items())
+        notes.print(f"tlf: note: as {name} asks: {told}", markup=False, soft_wrap=True)
     folder = writable_folder(out or Path("results") / chosen.name)
     warn_of_compiling()
     with progress_bar(f"{chosen.name}, {name}") as update:
@@ -184,8 +188,8 @@ def metrics_table(record: Any) -> Table:
         ("slip max\nmm/s", "slip_max_mm_s", 1),
     ]
     table.add_column("robot")
-    for title, _, _ in columns:
-        table.add_column(title, justify="right")
+    for heading, _, _ in columns:
+        table.add_column(heading, justify="right")
     table.add_column("end")
     for i, metrics in enumerate(record.metrics()):
         row = metrics._asdict() | {"saturation_fraction": 100 * metrics.saturation_fraction}
@@ -350,15 +354,17 @@ def draw_bench(board: dict[str, Any], folder: Path) -> None:
 
 def board_table(board: dict[str, Any]) -> Table:
     """Policies over all tasks and disturbances."""
+    from baselines.aggregate import title
+
     table = Table(title="score 0 to 100, interquartile mean over all runs", box=SIMPLE_HEAD)
     table.add_column("policy")
-    for title in ("score", "95 %", "normalised", "better than\nreference", "failed"):
-        table.add_column(title, justify="right")
+    for heading in ("score", "95 %", "normalised", "better than\nreference", "failed"):
+        table.add_column(heading, justify="right")
     for row in board["policies"]:
         ends, better = row["score"]["interval"], row["probability_of_improvement"]
         scaled = row["normalised_score"]
         table.add_row(
-            row["policy"] + (" (privileged)" if row["privileged"] else ""),
+            title(row),
             f"{row['score']['iqm']:.1f}",
             "–" if ends is None else f"{ends[0]:.1f}–{ends[1]:.1f}",
             "–" if scaled is None else f"{scaled:.2f}",
