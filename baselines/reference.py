@@ -7,18 +7,22 @@ from typing import Any
 import numpy as np
 
 from tlf_env.numerics.compiled import driver
-from tlf_env.onboard.tracking import Gains, TrackingGains, gains_row, tracking_gains
-from tlf_env.task.actions import ACTION_SIZE, limited, reference_action
-from tlf_env.task.observation import TRACKING_ENTRIES, Tracking
-
-SCALES = np.array([entry.scale for entry in TRACKING_ENTRIES.values()])
+from tlf_env.onboard.tracking import (
+    Controller,
+    ControllerRow,
+    TrackingGains,
+    controller,
+    controller_row,
+)
+from tlf_env.task.actions import ACTION_SIZE, reference_action
+from tlf_env.task.observation import Tracking, tracking_entries
+from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S, DEFAULT_PREVIEW_S
 
 
 @driver
-def _actions(rows: np.ndarray, scales: np.ndarray, gains: Gains, out: np.ndarray) -> None:
+def _actions(rows: np.ndarray, scales: np.ndarray, row: ControllerRow, out: np.ndarray) -> None:
     for i in range(rows.shape[0]):
-        a_0, a_1 = reference_action(rows[i], scales, gains)
-        out[i, 0], out[i, 1] = limited(a_0), limited(a_1)
+        out[i, 0], out[i, 1] = reference_action(rows[i], scales, row)
 
 
 class ReferencePolicy:
@@ -27,7 +31,10 @@ class ReferencePolicy:
     Parameters
     ----------
     gains
-        ``"consistent"`` (k₂ = 0.83·k₃), ``"printed"`` (k₂ = 0.83 mm²/s), or :class:`TrackingGains`.
+        ``"consistent"`` (k₂ = 0.83·k₃), ``"printed"`` (k₂ = 0.83 mm²/s), ``"tuned"`` (other gains,
+        and limits on the twist), :class:`TrackingGains` or :class:`Controller`.
+    control_period_s
+        Period at which it acts: limits on accelerations need it.
 
     Raises
     ------
@@ -37,9 +44,20 @@ class ReferencePolicy:
 
     privileged = False
 
-    def __init__(self, gains: str | TrackingGains = "consistent") -> None:
-        self.gains = tracking_gains(gains) if isinstance(gains, str) else gains
-        self._row = gains_row(self.gains)
+    def __init__(
+        self,
+        gains: str | TrackingGains | Controller = "consistent",
+        control_period_s: float = DEFAULT_CONTROL_PERIOD_S,
+        preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S,
+    ) -> None:
+        if isinstance(gains, str):
+            self.controller = controller(gains)
+        elif isinstance(gains, TrackingGains):
+            self.controller = Controller(gains=gains)
+        else:
+            self.controller = gains
+        self._scales = np.array([entry.scale for entry in tracking_entries(preview_s).values()])
+        self._row = controller_row(self.controller, control_period_s, preview_s)
 
     def predict(
         self,
@@ -66,5 +84,5 @@ class ReferencePolicy:
             )
         rows = np.ascontiguousarray(np.atleast_2d(observation))
         action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
-        _actions(rows, SCALES, self._row, action)
+        _actions(rows, self._scales, self._row, action)
         return (action[0] if observation.ndim == 1 else action), state

@@ -112,3 +112,19 @@ def writer(row: type[Any]) -> Callable[..., Any]:
     scope: dict[str, Any] = {}
     exec(f"def write(a, r, l, row):\n{lines}\n", scope)
     return law(scope["write"])
+
+
+def slot_reader(row: type[Any]) -> Callable[..., Any]:
+    """Compiled ``read(ring, slot, robot, lane)`` that gathers a named tuple from a ring of them."""
+    fields = ", ".join(f"a[{i}, k, r, l]" for i in range(len(row._fields)))
+    scope: dict[str, Any] = {"Row": row}
+    exec(f"def read(a, k, r, l):\n    return Row({fields})\n", scope)
+    return law(scope["read"])
+
+
+def slot_writer(row: type[Any]) -> Callable[..., Any]:
+    """Compiled ``write(ring, slot, robot, lane, row)``, the inverse of :func:`slot_reader`."""
+    lines = "\n".join(f"    a[{i}, k, r, l] = row.{name}" for i, name in enumerate(row._fields))
+    scope: dict[str, Any] = {}
+    exec(f"def write(a, k, r, l, row):\n{lines}\n", scope)
+    return law(scope["write"])

@@ -58,6 +58,17 @@ def observer_rates(
 
 
 @law
+def dead_reckoned(m: Message, duration: float) -> Message:
+    """Where the sender is ``duration`` s after a message if it goes on with the twist it told."""
+    turn = m.u_2 * duration
+    middle = m.theta + 0.5 * turn
+    way = m.u_1 * duration
+    return Message(
+        m.x - way * math.sin(middle), m.y + way * math.cos(middle), m.theta + turn, m.u_1, m.u_2
+    )
+
+
+@law
 def observed_reference(
     x: float, y: float, theta: float, rate_x: float, rate_y: float, rate_theta: float
 ) -> Reference:

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law
+from tlf_env.onboard.limiter import Limits, TwistLimits, limits_row
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
 HEADING_DAMPING_PER_S = 0.83
@@ -35,11 +36,43 @@ class Gains(NamedTuple):
     epsilon: float
 
 
+class Controller(Frozen):
+    """The tracking law's gains and the limits on what it asks for.
+
+    With ``lead_s`` the reference's twist enters as it will be so much later, by a straight line to the
+    first preview: what is asked for holds for a control period, and the wheel loop takes its time.
+    """
+
+    gains: TrackingGains = TrackingGains()
+    limits: TwistLimits = TwistLimits()
+    lead_s: NonNegative = 0.0
+
+
+class ControllerRow(NamedTuple):
+    """The same numbers as the compiled law takes them."""
+
+    gains: Gains
+    limits: Limits
+    lead: float  # as a fraction of the time to the first preview
+
+
 # `consistent` reads the printed k₂ = 0.83 as the ratio k₂/k₃ in 1/s, of the same size as k₁; `printed`
 # takes it as it stands, 0.83 mm²/s, which leaves the heading almost undamped. See docs/controller.md.
 GAIN_PRESETS: dict[str, TrackingGains] = {
     "consistent": TrackingGains(),
     "printed": TrackingGains(k_2_mm2_s=0.83),
+}
+TUNED: dict[str, Controller] = {
+    "tuned": Controller(
+        gains=TrackingGains(k_1_per_s=0.5, k_2_mm2_s=2.2 * 1.35e5, k_3_mm2=1.35e5),
+        limits=TwistLimits(
+            forward_error_mm=320.0,
+            acceleration_mm_s2=150.0,
+            yaw_acceleration_rad_s2=5.0,
+            lateral_acceleration_mm_s2=185.0,
+            cancel_slip=True,
+        ),
+    ),
 }
 
 
@@ -54,6 +87,37 @@ def tracking_gains(name: str) -> TrackingGains:
     if name not in GAIN_PRESETS:
         raise ValueError(f"gains {name!r} is not one of {', '.join(sorted(GAIN_PRESETS))}")
     return GAIN_PRESETS[name]
+
+
+def controller(name: str) -> Controller:
+    """Gains and limits of a preset.
+
+    Raises
+    ------
+    ValueError
+        naming the presets there are.
+    """
+    if name in TUNED:
+        return TUNED[name]
+    return Controller(gains=tracking_gains(name))
+
+
+def controller_row(
+    known: Controller, period_s: float, preview_s: tuple[float, ...] = ()
+) -> ControllerRow:
+    """Gains and limits for a control period and preview times (s), as the compiled law takes them.
+
+    Raises
+    ------
+    ValueError
+        if there is a lead and no preview to make it from.
+    """
+    if known.lead_s and not (preview_s and preview_s[0] > 0):
+        raise ValueError(
+            f"lead_s {known.lead_s} needs a first preview above 0, got preview_s {preview_s}"
+        )
+    lead = known.lead_s / preview_s[0] if known.lead_s else 0.0
+    return ControllerRow(gains_row(known.gains), limits_row(known.limits, period_s), lead)
 
 
 def gains_row(gains: TrackingGains) -> Gains:

@@ -5,9 +5,10 @@ from __future__ import annotations
 import numpy as np
 
 from tlf_env.numerics.compiled import law
-from tlf_env.onboard.tracking import Gains, tracking_twist
+from tlf_env.onboard.limiter import limited_twist, saturated_error
+from tlf_env.onboard.tracking import ControllerRow, tracking_twist
 from tlf_env.physics.parameters import Body
-from tlf_env.task.observation import Entry, Tracking
+from tlf_env.task.observation import Entry, Preview, Tracking
 
 ACTION_SIZE = 2
 TWIST, WHEEL_SPEED, TORQUE, RESIDUAL = range(4)
@@ -51,6 +52,12 @@ SIN_E_3 = Tracking._fields.index("sin_e_3")
 COS_E_3 = Tracking._fields.index("cos_e_3")
 U_1 = Tracking._fields.index("reference_u_1")
 U_2 = Tracking._fields.index("reference_u_2")
+COMMAND_1 = Tracking._fields.index("command_u_1")
+COMMAND_2 = Tracking._fields.index("command_u_2")
+LATER_U_1 = len(Tracking._fields) + Preview._fields.index("u_1")
+LATER_U_2 = len(Tracking._fields) + Preview._fields.index("u_2")
+SLIP_1 = Tracking._fields.index("slip_1")
+SLIP_2 = Tracking._fields.index("slip_2")
 
 
 @law
@@ -60,23 +67,49 @@ def limited(a: float) -> float:
 
 
 @law
-def reference_action(
-    observation: np.ndarray, scales: np.ndarray, gains: Gains
+def wanted_twist(
+    observation: np.ndarray, scales: np.ndarray, row: ControllerRow
 ) -> tuple[float, float]:
-    """The tracking law, eqs (16)–(21), in units of a ``twist`` action, from one ``tracking`` observation.
-
-    Not limited yet: a residual is added before.
-    """
-    u_1, u_2 = tracking_twist(
-        observation[E_1] * scales[E_1],
+    """The tracking law, eqs (16)–(21), from one ``tracking`` observation: a twist in mm/s, rad/s."""
+    u_1, u_2 = observation[U_1] * scales[U_1], observation[U_2] * scales[U_2]
+    if row.lead > 0.0:
+        u_1 += row.lead * (observation[LATER_U_1] * scales[LATER_U_1] - u_1)
+        u_2 += row.lead * (observation[LATER_U_2] * scales[LATER_U_2] - u_2)
+    return tracking_twist(
+        saturated_error(observation[E_1] * scales[E_1], row.limits),
         observation[E_2] * scales[E_2],
         observation[SIN_E_3] * scales[SIN_E_3],
         observation[COS_E_3] * scales[COS_E_3],
-        observation[U_1] * scales[U_1],
-        observation[U_2] * scales[U_2],
-        gains,
+        u_1,
+        u_2,
+        row.gains,
     )
-    return u_1 / FULL_SPEED_MM_S, u_2 / FULL_YAW_RATE_RAD_S
+
+
+@law
+def twist_action(
+    observation: np.ndarray, scales: np.ndarray, row: ControllerRow, u_1: float, u_2: float
+) -> tuple[float, float]:
+    """The ``twist`` action that asks the wheels for a twist (mm/s, rad/s), within the limits."""
+    v_1, v_2 = limited_twist(
+        u_1,
+        u_2,
+        observation[COMMAND_1] * scales[COMMAND_1],
+        observation[COMMAND_2] * scales[COMMAND_2],
+        observation[SLIP_1] * scales[SLIP_1],
+        observation[SLIP_2] * scales[SLIP_2],
+        row.limits,
+    )
+    return limited(v_1 / FULL_SPEED_MM_S), limited(v_2 / FULL_YAW_RATE_RAD_S)
+
+
+@law
+def reference_action(
+    observation: np.ndarray, scales: np.ndarray, row: ControllerRow
+) -> tuple[float, float]:
+    """The reference's ``twist`` action from one ``tracking`` observation."""
+    u_1, u_2 = wanted_twist(observation, scales, row)
+    return twist_action(observation, scales, row, u_1, u_2)
 
 
 @law

@@ -10,6 +10,7 @@ import numpy as np
 from tlf_env.numerics.compiled import reader, writer
 from tlf_env.onboard.estimator import Estimate, ekf_constants
 from tlf_env.onboard.observer import Message, Reference
+from tlf_env.onboard.slip_estimator import SlipEstimate, slip_ekf_constants
 from tlf_env.onboard.wheel_loop import WheelLoopParameters, WheelLoopState, digital_wheel_loop
 from tlf_env.physics.parameters import body_array
 from tlf_env.physics.state import Contact, Motion
@@ -136,6 +137,7 @@ class Arrays(NamedTuple):
     bodies: np.ndarray
     wheel_loops: np.ndarray
     ekfs: np.ndarray
+    slip_ekfs: np.ndarray
     levels: np.ndarray  # (lane,) of the disturbance
     signals: np.ndarray  # (channel, SignalRow)
     patches: np.ndarray  # (patch, PatchRow)
@@ -151,6 +153,7 @@ class Arrays(NamedTuple):
     loop_states: np.ndarray
     sensors: np.ndarray
     estimates: np.ndarray
+    slip_estimates: np.ndarray
     traces: np.ndarray
     kinds: np.ndarray  # (robot, lane) int64: of each robot's action
     wanted: np.ndarray  # wheel speeds asked for (rad/s), or torques (mN·mm)
@@ -170,7 +173,7 @@ class Arrays(NamedTuple):
     # interface, formations first
     actions: np.ndarray  # (lane, robot, 2)
     last_actions: np.ndarray
-    base_actions: np.ndarray  # (lane, robot, 2): what a residual is added to, in the actions' dtype
+    twists: np.ndarray  # (lane, robot, 2): twist actions made on board, in the actions' dtype
     observations: np.ndarray  # (lane, robot, entry): `tracking`
     sensor_observations: (
         np.ndarray
@@ -234,6 +237,9 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         bodies=body_array(list(scenario.robot_models), lanes),
         wheel_loops=_constant(digital_wheel_loop(wheel_loop, scenario.physics_period_s), n, lanes),
         ekfs=_constant(ekf_constants(scenario.ekf), n, lanes),
+        slip_ekfs=_constant(
+            slip_ekf_constants(scenario.ekf_slip, scenario.physics_period_s), n, lanes
+        ),
         levels=np.full(lanes, scenario.disturbance.level),
         signals=signal_rows(
             scenario.disturbance, scenario.physics_period_s, scenario.control_period_s
@@ -249,6 +255,7 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         loop_states=zeros(len(WheelLoopState._fields)),
         sensors=zeros(len(Sensors._fields)),
         estimates=zeros(len(Estimate._fields)),
+        slip_estimates=zeros(len(SlipEstimate._fields)),
         traces=zeros(len(Trace._fields)),
         kinds=np.full((n, lanes), ACTION_KINDS[scenario.action], dtype=np.int64),
         wanted=zeros(2),
@@ -264,7 +271,7 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         seeds=np.zeros(lanes, dtype=np.int64),
         actions=np.zeros((lanes, n, ACTION_SIZE)),
         last_actions=np.zeros((lanes, n, ACTION_SIZE)),
-        base_actions=np.zeros((lanes, n, ACTION_SIZE), dtype=dtype),
+        twists=np.zeros((lanes, n, ACTION_SIZE), dtype=dtype),
         observations=np.zeros((lanes, n, entries), dtype=dtype),
         sensor_observations=np.zeros((lanes, n, sensor), dtype=dtype),
         starts=zeros(3),

@@ -13,6 +13,12 @@ import numpy as np
 from tlf_env.numerics.compiled import block, driver, law
 from tlf_env.numerics.philox import normal_pair
 from tlf_env.onboard.estimator import read_ekf, read_estimate, write_estimate
+from tlf_env.onboard.observer import Message
+from tlf_env.onboard.slip_estimator import (
+    read_slip_ekf,
+    read_slip_estimate,
+    write_slip_estimate,
+)
 from tlf_env.onboard.wheel_loop import read_loop_state, read_wheel_loop, write_loop_state
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
 from tlf_env.physics.state import (
@@ -25,15 +31,15 @@ from tlf_env.physics.state import (
 from tlf_env.task.actions import (
     FULL_RESIDUAL_MM_S,
     FULL_RESIDUAL_RAD_S,
-    FULL_SPEED_MM_S,
     FULL_TORQUE_NMM,
-    FULL_YAW_RATE_RAD_S,
     REFERENCE,
     RESIDUAL,
     TORQUE,
     TWIST,
     limited,
     reference_action,
+    twist_action,
+    wanted_twist,
     wheel_command,
 )
 from tlf_env.task.arrays import (
@@ -54,7 +60,7 @@ from tlf_env.task.judging import (
     record_truth,
 )
 from tlf_env.task.outlines import mark_touched, room_to_move
-from tlf_env.task.radio import broadcast, message_slot, next_reference
+from tlf_env.task.radio import broadcast, delayed_message, next_reference
 from tlf_env.task.settings import Settings
 from tlf_env.task.substeps import (
     EXTERNAL_TORQUE,
@@ -78,11 +84,12 @@ def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
         return a_0 * full, a_1 * full
     body = read_body(a.bodies, r, lane)
     if kind == RESIDUAL:
-        base = a.base_actions[lane, r]
-        base[0], base[1] = reference_action(a.observations[lane, r], a.scales, s.base)
-        b_0 = base[0] + a_0 * FULL_RESIDUAL_MM_S / FULL_SPEED_MM_S
-        b_1 = base[1] + a_1 * FULL_RESIDUAL_RAD_S / FULL_YAW_RATE_RAD_S
-        return wheel_command(limited(b_0), limited(b_1), TWIST, body)
+        seen, given = a.observations[lane, r], a.twists[lane, r]
+        u_1, u_2 = wanted_twist(seen, a.scales, s.base)
+        u_1 += a_0 * FULL_RESIDUAL_MM_S
+        u_2 += a_1 * FULL_RESIDUAL_RAD_S
+        given[0], given[1] = twist_action(seen, a.scales, s.base, u_1, u_2)
+        return wheel_command(given[0], given[1], TWIST, body)
     return wheel_command(a_0, a_1, kind, body)
 
 
@@ -100,9 +107,9 @@ def take_actions(a: Arrays, s: Settings) -> int:
     for lane in range(lanes):
         for r in range(robots):
             if a.kinds[r, lane] == REFERENCE:
-                base = a.base_actions[lane, r]
-                base[0], base[1] = reference_action(a.observations[lane, r], a.scales, s.base)
-                a.actions[lane, r, 0], a.actions[lane, r, 1] = limited(base[0]), limited(base[1])
+                given = a.twists[lane, r]
+                given[0], given[1] = reference_action(a.observations[lane, r], a.scales, s.base)
+                a.actions[lane, r, 0], a.actions[lane, r, 1] = given[0], given[1]
             a_0, a_1 = limited(a.actions[lane, r, 0]), limited(a.actions[lane, r, 1])
             clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]
             if clipped:
@@ -199,13 +206,15 @@ def sense(a: Arrays, k: int, s: Settings) -> None:
     """The second half of substep ``k`` of lane 0: sensors and estimator, and which outlines meet."""
     tick = a.clock[0, 0] + 1
     for r in range(a.motions.shape[1]):
-        sensors, estimate, trace, sample = sense_robot(
+        sensors, estimate, slip, trace, sample = sense_robot(
             read_body(a.bodies, r, 0),
             read_ekf(a.ekfs, r, 0),
+            read_slip_ekf(a.slip_ekfs, r, 0),
             read_effects(a.applied, r, 0),
             read_motion(a.motions, r, 0),
             read_sensors(a.sensors, r, 0),
             read_estimate(a.estimates, r, 0),
+            read_slip_estimate(a.slip_estimates, r, 0),
             read_trace(a.traces, r, 0),
             a.seeds[0],
             a.clock[0, 2],
@@ -217,15 +226,16 @@ def sense(a: Arrays, k: int, s: Settings) -> None:
         write_sample(a.samples[k], r, 0, sample)
         write_sensors(a.sensors, r, 0, sensors)
         write_estimate(a.estimates, r, 0, estimate)
+        write_slip_estimate(a.slip_estimates, r, 0, slip)
         write_trace(a.traces, r, 0, trace)
     a.clock[0, 0] = tick
     mark_touched(a, 0)
 
 
 @driver
-def message_slot_of(a: Arrays, r: int, step: int, s: Settings) -> int:
-    """:func:`message_slot` of lane 0, for observers outside."""
-    return message_slot(a, 0, r, step, s)
+def delayed_message_of(a: Arrays, r: int, step: int, s: Settings) -> Message:
+    """:func:`delayed_message` of lane 0, for observers outside."""
+    return delayed_message(a, 0, r, step, s)
 
 
 @driver

@@ -96,7 +96,15 @@ class Formation:
         leader's reference that much later on its trajectory.
         """
         a, s = self.arrays, self.scenario
-        for state in (a.motions, a.contacts, a.loop_states, a.sensors, a.estimates, a.traces):
+        for state in (
+            a.motions,
+            a.contacts,
+            a.loop_states,
+            a.sensors,
+            a.estimates,
+            a.slip_estimates,
+            a.traces,
+        ):
             state[:] = 0.0
         for state in (a.actions, a.last_actions, a.infos, a.samples):
             state[:] = 0.0

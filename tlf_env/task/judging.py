@@ -6,15 +6,16 @@ import math
 
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import block, law
-from tlf_env.onboard.estimator import read_estimate
+from tlf_env.onboard.estimator import odometry, read_estimate
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.tracking import body_errors
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Body
-from tlf_env.physics.state import axle_midpoint, read_motion
+from tlf_env.physics.state import axle_midpoint, read_body, read_motion
+from tlf_env.task.actions import TORQUE
 from tlf_env.task.arrays import Arrays, Info, read_trace
 from tlf_env.task.measures import distance, time_gap_error
 from tlf_env.task.observation import SensorTail, Tracking, preview_entries, scaled
-from tlf_env.task.radio import delayed_message, read_reference
+from tlf_env.task.radio import DELTA_1, DELTA_2, delayed_message, read_reference
 from tlf_env.task.reward import reward_terms
 from tlf_env.task.settings import Settings
 
@@ -34,6 +35,10 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     sin_e3, cos_e3 = math.sin(e_3), math.cos(e_3)
     per_substep = 1.0 / s.substeps
     to_Nmm = per_substep / MILLINEWTON_PER_NEWTON
+    command_1 = command_2 = 0.0
+    if a.kinds[r, lane] != TORQUE:
+        body = read_body(a.bodies, r, lane)
+        command_1, command_2 = odometry(a.wanted[0, r, lane], a.wanted[1, r, lane], body.R, body.h)
     row = Tracking(
         e_1,
         e_2,
@@ -48,10 +53,12 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
         trace.turn / s.period,
         a.last_actions[lane, r, 0],
         a.last_actions[lane, r, 1],
+        command_1,
+        command_2,
         trace.innovation_forward * per_substep,
         trace.innovation_right * per_substep,
-        0.0,
-        0.0,
+        a.slip_estimates[DELTA_1, r, lane],
+        a.slip_estimates[DELTA_2, r, lane],
         trace.torque_l * to_Nmm,
         trace.torque_r * to_Nmm,
         1.0 if r == 0 else 0.0,

@@ -37,6 +37,8 @@ class Tracking(NamedTuple):
     odometry_u_2: float
     last_action_0: float
     last_action_1: float
+    command_u_1: float
+    command_u_2: float
     innovation_forward: float
     innovation_right: float
     slip_1: float
@@ -61,6 +63,8 @@ TRACKING_ENTRIES = {
     "odometry_u_2": Entry("yaw rate by the wheels, mean over the last step", "rad/s", 2.0),
     "last_action_0": Entry("last action, first component", "1", 1.0),
     "last_action_1": Entry("last action, second component", "1", 1.0),
+    "command_u_1": Entry("speed last asked of the wheels; 0 with action `torque`", "mm/s", 1000.0),
+    "command_u_2": Entry("yaw rate last asked of the wheels; 0 with action `torque`", "rad/s", 8.0),
     "innovation_forward": Entry("EKF innovation forward, mean over the last step", "mm", 1.0),
     "innovation_right": Entry("EKF innovation to the right, mean over the last step", "mm", 1.0),
     "slip_1": Entry("estimate of the slip δ₁; 0 with the paper's EKF", "mm/s", 100.0),

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tlf_env.onboard.observer import Message
 from tlf_env.onboard.parts import Factory, finite, load_part
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
 from tlf_env.task import drivers
@@ -17,7 +16,7 @@ from tlf_env.task.settings import Settings
 SPEEDS = [Sensors._fields.index("speed_l"), Sensors._fields.index("speed_r")]
 STEPS = [Sample._fields.index("step_l"), Sample._fields.index("step_r")]
 FIXES = [Sample._fields.index("fix_x"), Sample._fields.index("fix_y")]
-BUILT_IN_ESTIMATORS = ("ekf", "truth")
+BUILT_IN_ESTIMATORS = ("ekf", "ekf-slip", "truth")
 
 
 def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[str, Factory]:
@@ -101,8 +100,7 @@ class Parts:
             self._observe_one(a, s, r, int(a.clock[0, 1]) + s.lookahead)
 
     def _observe_one(self, a: Arrays, s: Settings, r: int, m: int) -> None:
-        old = drivers.message_slot_of(a, r, m, s)
-        message = Message(*a.messages[:, old, r - 1, 0].tolist())
+        message = drivers.delayed_message_of(a, r, m, s)
         reference = self._made["observer"][r].update(message, m * s.period)
         row = finite(reference, 5, f"robot_{r}: the observer's update()")
         a.references[:, m % a.references.shape[1], r, 0] = row

@@ -4,67 +4,74 @@ from __future__ import annotations
 
 import math
 
-from tlf_env.numerics.compiled import block, law
+from tlf_env.numerics.compiled import block, law, slot_reader, slot_writer
 from tlf_env.numerics.philox import unit, words
 from tlf_env.onboard.observer import (
     Message,
     Reference,
+    dead_reckoned,
     observed_reference,
     observer_rates,
     smoothing,
 )
+from tlf_env.onboard.slip_estimator import SlipEstimate
 from tlf_env.task.arrays import Arrays, read_trace
 from tlf_env.task.channels import DROPOUT, JITTER, RADIO_DROPOUT, RADIO_JITTER
 from tlf_env.task.settings import Settings
 
+DELTA_1 = SlipEstimate._fields.index("delta_1")
+DELTA_2 = SlipEstimate._fields.index("delta_2")
+
+
+read_message = slot_reader(Message)
+write_message = slot_writer(Message)
+
 
 @block
 def broadcast(a: Arrays, lane: int, r: int, step: int, period: float) -> None:
-    """Put robot ``r``'s estimated pose and odometry twist on the air."""
+    """Put robot ``r``'s estimated pose and twist (odometry and estimated slip) on the air.
+
+    If the broadcast is lost, whoever listens goes on from the last message, by dead reckoning.
+    """
     slot = step % a.messages.shape[1]
     trace = read_trace(a.traces, r, lane)
-    for i in range(3):
-        a.messages[i, slot, r, lane] = a.estimates[i, r, lane]
-    a.messages[3, slot, r, lane] = trace.distance / period
-    a.messages[4, slot, r, lane] = trace.turn / period
+    message = Message(
+        a.estimates[0, r, lane],
+        a.estimates[1, r, lane],
+        a.estimates[2, r, lane],
+        trace.distance / period + a.slip_estimates[DELTA_1, r, lane],
+        trace.turn / period + a.slip_estimates[DELTA_2, r, lane],
+    )
     dropout = a.applied[DROPOUT, r, lane]
     lost = False
     if dropout > 0.0 and step > 0:
         word, _, _, _ = words(a.seeds[lane], RADIO_DROPOUT, r, a.clock[lane, 2], step)
         lost = unit(word) < dropout
     a.dropped[slot, r, lane] = lost
-    if lost:  # whoever listens goes on with the last message that arrived
+    if lost:
         before = (step - 1) % a.messages.shape[1]
-        for i in range(a.messages.shape[0]):
-            a.messages[i, slot, r, lane] = a.messages[i, before, r, lane]
+        message = dead_reckoned(read_message(a.messages, before, r, lane), period)
+    write_message(a.messages, slot, r, lane, message)
 
 
 @law
-def message_slot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> int:
-    """Where the message is that robot ``r`` uses at a control step: one gap old, or older.
+def delayed_message(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
+    """What robot ``r`` knows at a control step of its predecessor one gap before.
 
-    Jitter makes it older by a fresh draw for each step, up to whole control periods within it. Before
-    the first gap has passed it is the predecessor's start.
+    Jitter makes the newest message older by a fresh draw for each step, up to whole control periods
+    within it; messages carry their time, so the rest is dead reckoning. Before the first gap has
+    passed it is the predecessor's start, at rest.
     """
     late = 0
     jitter = a.applied[JITTER, r, lane]
     if jitter > 0.0:
         word, _, _, _ = words(a.seeds[lane], RADIO_JITTER, r, a.clock[lane, 2], step)
         late = int(unit(word) * (math.floor(jitter / s.period + 1e-9) + 1.0))
-    return max(step - s.gap - late, 0) % a.messages.shape[1]
-
-
-@law
-def delayed_message(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
-    """What robot ``r`` hears from its predecessor for a control step."""
-    old = message_slot(a, lane, r, step, s)
-    return Message(
-        a.messages[0, old, r - 1, lane],
-        a.messages[1, old, r - 1, lane],
-        a.messages[2, old, r - 1, lane],
-        a.messages[3, old, r - 1, lane],
-        a.messages[4, old, r - 1, lane],
-    )
+    old = max(step - s.gap - late, 0)
+    message = read_message(a.messages, old % a.messages.shape[1], r - 1, lane)
+    if late > 0:
+        message = dead_reckoned(message, min(late, max(step - s.gap, 0)) * s.period)
+    return message
 
 
 @block

@@ -15,7 +15,8 @@ from tlf_env.numerics.errors import one_line
 from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import PART_PATTERN
-from tlf_env.onboard.tracking import tracking_gains
+from tlf_env.onboard.slip_estimator import SlipEkfParameters
+from tlf_env.onboard.tracking import controller, controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive, RobotParameters
 from tlf_env.task.disturbance import Disturbance
@@ -27,6 +28,7 @@ from tlf_env.task.waypoints import scenario_of_waypoints
 PACKAGE = Path(__file__).resolve().parent.parent
 MAX_ROBOTS = 1000
 DEFAULT_CONTROL_PERIOD_S = 0.02
+DEFAULT_PREVIEW_S = (0.5, 1.0)
 SETTLE_FRACTION = 0.4
 START_MARGIN_MM = 1.0  # between outlines at the start
 DIVIDES_TOLERANCE = 1e-9
@@ -115,8 +117,9 @@ class Scenario(Frozen):
     plant: Literal["pymunk", "kinematic"] = "pymunk"
 
     wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
-    estimator: Literal["ekf", "truth"] | PartPath = "ekf"
+    estimator: Literal["ekf", "ekf-slip", "truth"] | PartPath = "ekf"
     ekf: EkfParameters = EkfParameters()
+    ekf_slip: SlipEkfParameters = SlipEkfParameters()
     observer: ObserverParameters | PartPath = ObserverParameters()
 
     disturbance: Disturbance = Disturbance()
@@ -126,7 +129,7 @@ class Scenario(Frozen):
     residual_base: str = "consistent"  # gains of the tracking law that a residual is added to
     observation: Literal["tracking", "sensor"] = "tracking"
     dtype: Literal["float32", "float64"] = "float32"  # of observations and actions
-    preview_s: tuple[NonNegative, ...] = (0.5, 1.0)
+    preview_s: tuple[NonNegative, ...] = DEFAULT_PREVIEW_S
     reward: dict[str, FiniteFloat] = Field(
         default_factory=lambda: FrozenDict(DEFAULT_WEIGHTS._asdict())
     )
@@ -216,7 +219,7 @@ class Scenario(Frozen):
                 f"actuator.computing_delay_s reaches {delay * self.disturbance.level:g}; it must be at "
                 f"most one control_period_s, {self.control_period_s}"
             )
-        tracking_gains(self.residual_base)
+        controller_row(controller(self.residual_base), self.control_period_s, self.preview_s)
         if self.plant == "kinematic" and (
             self.action == "torque" or isinstance(self.wheel_loop, str)
         ):

@@ -5,12 +5,12 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from tlf_env.onboard.observer import ObserverParameters
-from tlf_env.onboard.tracking import Gains, gains_row, tracking_gains
+from tlf_env.onboard.tracking import ControllerRow, controller, controller_row
 from tlf_env.task.disturbance import changes_within_episode
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.scenario import Scenario
 
-EKF, TRUTH, EXTERNAL = range(3)
+EKF, TRUTH, EXTERNAL, EKF_SLIP = range(4)
 
 
 class Settings(NamedTuple):
@@ -26,20 +26,20 @@ class Settings(NamedTuple):
     observer_gain: float  # 1/s
     smoothing: float  # s
     lost_beyond: float  # mm
-    estimator: int  # EKF, TRUTH or EXTERNAL
+    estimator: int  # EKF, TRUTH, EXTERNAL or EKF_SLIP
     external_wheel_loop: bool
     external_observer: bool
     cooperative: bool  # every robot gets the formation's mean reward
     changing: bool  # whether a channel of every substep varies within an episode
     adversary: bool
-    base: Gains  # of the twist that a residual is added to
+    base: ControllerRow  # of the twist that a residual is added to
 
 
 def settings(scenario: Scenario) -> Settings:
     """The scenario's numbers as the drivers take them."""
     observer = scenario.observer
     paper = observer if isinstance(observer, ObserverParameters) else ObserverParameters()
-    kinds = {"ekf": EKF, "truth": TRUTH}
+    kinds = {"ekf": EKF, "ekf-slip": EKF_SLIP, "truth": TRUTH}
     return Settings(
         kinematic=scenario.plant == "kinematic",
         substeps=scenario.substeps,
@@ -57,5 +57,7 @@ def settings(scenario: Scenario) -> Settings:
         cooperative=scenario.cooperative,
         changing=changes_within_episode(scenario.disturbance),
         adversary=scenario.adversary,
-        base=gains_row(tracking_gains(scenario.residual_base)),
+        base=controller_row(
+            controller(scenario.residual_base), scenario.control_period_s, scenario.preview_s
+        ),
     )

@@ -22,6 +22,15 @@ from tlf_env.onboard.estimator import (
     read_estimate,
     write_estimate,
 )
+from tlf_env.onboard.slip_estimator import (
+    SlipEkf,
+    SlipEstimate,
+    correct_with_slip,
+    predict_with_slip,
+    read_slip_ekf,
+    read_slip_estimate,
+    write_slip_estimate,
+)
 from tlf_env.onboard.tracking import body_errors
 from tlf_env.onboard.wheel_loop import (
     WheelLoop,
@@ -71,7 +80,7 @@ from tlf_env.task.channels import (
     SUBSTEP_CHANNELS,
 )
 from tlf_env.task.disturbance import Effects, wheel_factors
-from tlf_env.task.settings import EKF, TRUTH, Settings
+from tlf_env.task.settings import EKF, EKF_SLIP, TRUTH, Settings
 from tlf_env.task.signals import SignalRow, signal_value
 
 EXTERNAL_TORQUE = 4  # stands for the kind of a robot whose wheel loop is an object outside
@@ -161,10 +170,12 @@ def actuate_robot(
 def sense_robot(
     body: Body,
     ekf: Ekf,
+    slip_ekf: SlipEkf,
     effects: Effects,
     motion: Motion,
     sensors: Sensors,
     estimate: Estimate,
+    slip: SlipEstimate,
     trace: Trace,
     seed: int,
     episode: int,
@@ -172,7 +183,7 @@ def sense_robot(
     tick: int,
     kind: int,
     dt: float,
-) -> tuple[Sensors, Estimate, Trace, Sample]:
+) -> tuple[Sensors, Estimate, SlipEstimate, Trace, Sample]:
     """Encoders, position fix and estimator (of the ``kind``) after substep ``tick`` of one robot."""
     read_l, read_r = motion.angle_l, motion.angle_r
     if effects.encoder_std > 0.0:
@@ -194,13 +205,23 @@ def sense_robot(
     d_x = d_y = nis = 0.0
     if kind == EKF:
         estimate, d_x, d_y, nis = correct(predict(estimate, ekf, u_1, u_2), ekf, x, y)
+    elif kind == EKF_SLIP:
+        estimate, slip = predict_with_slip(estimate, slip, slip_ekf, u_1, u_2, dt)
+        estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y)
     elif kind == TRUTH:
         true_x, true_y = axle_midpoint(motion, body.d)
+        turned = motion.theta - estimate.theta
+        moved, _ = body_errors(
+            true_x - estimate.x, true_y - estimate.y, estimate.theta + 0.5 * turned
+        )
+        unknown = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        slip = SlipEstimate((moved - u_1) / dt, (turned - u_2) / dt, *unknown)
         estimate = Estimate(true_x, true_y, motion.theta, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     forward, right = body_errors(d_x, d_y, estimate.theta)
     return (
         Sensors(read_l, read_r, step_l / dt, step_r / dt),
         estimate,
+        slip,
         Trace(
             trace.distance + u_1,
             trace.turn + u_2,
@@ -259,12 +280,14 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
         body = read_body(a.bodies, r, lane)
         loop = read_wheel_loop(a.wheel_loops, r, lane)
         ekf = read_ekf(a.ekfs, r, lane)
+        slip_ekf = read_slip_ekf(a.slip_ekfs, r, lane)
         effects = read_effects(a.applied, r, lane)
         motion = read_motion(a.motions, r, lane)
         contact = read_contact(a.contacts, r, lane)
         held = read_loop_state(a.loop_states, r, lane)
         sensors = read_sensors(a.sensors, r, lane)
         estimate = read_estimate(a.estimates, r, lane)
+        slip = read_slip_estimate(a.slip_estimates, r, lane)
         trace = read_trace(a.traces, r, lane)
         kind = a.kinds[r, lane]
         wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
@@ -297,13 +320,15 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
                 s.kinematic,
                 dt,
             )
-            sensors, estimate, trace, sample = sense_robot(
+            sensors, estimate, slip, trace, sample = sense_robot(
                 body,
                 ekf,
+                slip_ekf,
                 effects,
                 motion,
                 sensors,
                 estimate,
+                slip,
                 trace,
                 seed,
                 episode,
@@ -318,5 +343,6 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
         write_loop_state(a.loop_states, r, lane, held)
         write_sensors(a.sensors, r, lane, sensors)
         write_estimate(a.estimates, r, lane, estimate)
+        write_slip_estimate(a.slip_estimates, r, lane, slip)
         write_trace(a.traces, r, lane, trace)
     a.clock[lane, 0] = first + substeps

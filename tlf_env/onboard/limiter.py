@@ -1,0 +1,86 @@
+"""Limits on the twist that a controller asks for, so that the tyres can give it.
+
+A lateral error of 100 mm asks the paper's law for 4 rad/s; the wheels skid, and a filter that assumes no
+slip loses the heading. The limits act on the twist that the body is expected to have, which is the
+wheels' twist plus the estimated slip δ₁, δ₂ of eq. (14). They are not the paper's.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from tlf_env.numerics.compiled import law
+from tlf_env.physics.parameters import Frozen, Positive
+
+
+class TwistLimits(Frozen):
+    """None leaves a limit out; without any the law is the paper's."""
+
+    forward_error_mm: Positive | None = None  # e₁ enters as E·tanh(e₁/E)
+    acceleration_mm_s2: Positive | None = None  # of u₁
+    yaw_acceleration_rad_s2: Positive | None = None  # of u₂
+    lateral_acceleration_mm_s2: Positive | None = None  # of |u₁ u₂|
+    cancel_slip: bool = False  # take the estimated slip off the wheels' twist
+
+
+class Limits(NamedTuple):
+    """The same as the compiled law takes them; infinity where there is none."""
+
+    forward_error: float
+    step_1: float  # mm/s per control step
+    step_2: float  # rad/s per control step
+    lateral: float
+    slip: float  # 1 if the estimated slip counts, else 0
+
+
+def limits_row(limits: TwistLimits, period_s: float) -> Limits:
+    """Limits for a control period, as the compiled law takes them."""
+
+    def finite(limit: float | None, factor: float = 1.0) -> float:
+        return math.inf if limit is None else limit * factor
+
+    return Limits(
+        finite(limits.forward_error_mm),
+        finite(limits.acceleration_mm_s2, period_s),
+        finite(limits.yaw_acceleration_rad_s2, period_s),
+        finite(limits.lateral_acceleration_mm_s2),
+        1.0 if limits.cancel_slip else 0.0,
+    )
+
+
+@law
+def saturated_error(e_1: float, limits: Limits) -> float:
+    """The forward error as the tracking law gets it, mm."""
+    if limits.forward_error == math.inf:
+        return e_1
+    return limits.forward_error * math.tanh(e_1 / limits.forward_error)
+
+
+@law
+def within(value: float, centre: float, reach: float) -> float:
+    """``value`` held within ``centre`` ± ``reach``."""
+    return min(max(value, centre - reach), centre + reach)
+
+
+@law
+def limited_twist(
+    u_1: float,
+    u_2: float,
+    last_1: float,
+    last_2: float,
+    delta_1: float,
+    delta_2: float,
+    limits: Limits,
+) -> tuple[float, float]:
+    """Twist for the wheels (mm/s, rad/s) if the body shall have ``u``.
+
+    ``last`` is the wheels' twist of the step before, ``delta`` the estimated slip. Speed goes before
+    turning: where both together are too much, the yaw rate gives way.
+    """
+    s_1, s_2 = limits.slip * delta_1, limits.slip * delta_2
+    b_1 = within(u_1, last_1 + s_1, limits.step_1)
+    b_2 = within(u_2, last_2 + s_2, limits.step_2)
+    if abs(b_1 * b_2) > limits.lateral:
+        b_2 = math.copysign(limits.lateral / abs(b_1), b_2)
+    return b_1 - s_1, b_2 - s_2

@@ -1,0 +1,185 @@
+"""Extended Kalman filter of pose and slip: the paper's filter with two states more, δ₁ and δ₂ of eq. (14).
+
+The wheels tell how far they rolled; the floor may move the robot on top of that, forward with δ₁ and
+in yaw with δ₂. Both are taken as random walks and are seen through the position fixes. The process
+noise is a variance per second, so that the filter is the same at every sampling rate.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.onboard.estimator import Estimate
+from tlf_env.physics.parameters import Frozen, NonNegative, Positive
+
+
+class SlipEkfParameters(Frozen):
+    """Noise of the filter, and the bounds that its slip estimates are held within."""
+
+    forward_noise_mm2_s: NonNegative = 2.5  # of the position along the heading
+    sideways_noise_mm2_s: NonNegative = 0.33
+    heading_noise_rad2_s: NonNegative = 4e-4
+    delta_1_walk_mm2_s3: NonNegative = 5.7
+    delta_2_walk_rad2_s3: NonNegative = 0.0088
+    fix_variance_mm2: Positive = 4.85
+    delta_1_bound_mm_s: NonNegative = 60.0
+    delta_2_bound_rad_s: NonNegative = 0.4
+
+
+class SlipEkf(NamedTuple):
+    """Constants of the filter; variances of the process noise per sample."""
+
+    forward: float
+    sideways: float
+    heading: float
+    walk_1: float
+    walk_2: float
+    variance: float
+    bound_1: float
+    bound_2: float
+
+
+class SlipEstimate(NamedTuple):
+    """Estimated δ₁ (mm/s), δ₂ (rad/s), and what their rows add to the covariance's upper triangle."""
+
+    delta_1: float
+    delta_2: float
+    p_x1: float
+    p_y1: float
+    p_t1: float
+    p_x2: float
+    p_y2: float
+    p_t2: float
+    p_11: float
+    p_12: float
+    p_22: float
+
+
+read_slip_ekf = reader(SlipEkf)
+read_slip_estimate = reader(SlipEstimate)
+write_slip_estimate = writer(SlipEstimate)
+
+
+def slip_ekf_constants(p: SlipEkfParameters, dt_s: float) -> SlipEkf:
+    """The filter's numbers for a sampling period of ``dt_s`` s, as the compiled law takes them."""
+    return SlipEkf(
+        p.forward_noise_mm2_s * dt_s,
+        p.sideways_noise_mm2_s * dt_s,
+        p.heading_noise_rad2_s * dt_s,
+        p.delta_1_walk_mm2_s3 * dt_s,
+        p.delta_2_walk_rad2_s3 * dt_s,
+        p.fix_variance_mm2,
+        p.delta_1_bound_mm_s,
+        p.delta_2_bound_rad_s,
+    )
+
+
+@law
+def predict_with_slip(
+    e: Estimate, z: SlipEstimate, ekf: SlipEkf, u_1: float, u_2: float, dt: float
+) -> tuple[Estimate, SlipEstimate]:
+    """Pose, slip and covariance one sample on, for increments u₁ (mm) and u₂ (rad) of the wheels."""
+    moved, turned = u_1 + z.delta_1 * dt, u_2 + z.delta_2 * dt
+    middle = e.theta + 0.5 * turned
+    sin, cos = math.sin(middle), math.cos(middle)
+    # F = I but for ∂(x, y)/∂θ = f, ∂(x, y)/∂δ₁ = h, ∂(x, y)/∂δ₂ = g, ∂θ/∂δ₂ = dt.
+    f_x, f_y = -moved * cos, -moved * sin
+    h_x, h_y = -sin * dt, cos * dt
+    g_x, g_y = 0.5 * dt * f_x, 0.5 * dt * f_y
+    m_xx = e.p_xx + f_x * e.p_xt + h_x * z.p_x1 + g_x * z.p_x2
+    m_xy = e.p_xy + f_x * e.p_yt + h_x * z.p_y1 + g_x * z.p_y2
+    m_xt = e.p_xt + f_x * e.p_tt + h_x * z.p_t1 + g_x * z.p_t2
+    m_x1 = z.p_x1 + f_x * z.p_t1 + h_x * z.p_11 + g_x * z.p_12
+    m_x2 = z.p_x2 + f_x * z.p_t2 + h_x * z.p_12 + g_x * z.p_22
+    m_yy = e.p_yy + f_y * e.p_yt + h_y * z.p_y1 + g_y * z.p_y2
+    m_yt = e.p_yt + f_y * e.p_tt + h_y * z.p_t1 + g_y * z.p_t2
+    m_y1 = z.p_y1 + f_y * z.p_t1 + h_y * z.p_11 + g_y * z.p_12
+    m_y2 = z.p_y2 + f_y * z.p_t2 + h_y * z.p_12 + g_y * z.p_22
+    m_tt = e.p_tt + dt * z.p_t2
+    m_t1 = z.p_t1 + dt * z.p_12
+    m_t2 = z.p_t2 + dt * z.p_22
+    return (
+        Estimate(
+            e.x - moved * sin,
+            e.y + moved * cos,
+            e.theta + turned,
+            m_xx
+            + (f_x * m_xt + h_x * m_x1 + g_x * m_x2)
+            + (sin * sin * ekf.forward + cos * cos * ekf.sideways),
+            m_xy
+            + (f_y * m_xt + h_y * m_x1 + g_y * m_x2)
+            + sin * cos * (ekf.sideways - ekf.forward),
+            m_xt + dt * m_x2,
+            m_yy
+            + (f_y * m_yt + h_y * m_y1 + g_y * m_y2)
+            + (cos * cos * ekf.forward + sin * sin * ekf.sideways),
+            m_yt + dt * m_y2,
+            m_tt + dt * m_t2 + ekf.heading,
+        ),
+        SlipEstimate(
+            z.delta_1,
+            z.delta_2,
+            m_x1,
+            m_y1,
+            m_t1,
+            m_x2,
+            m_y2,
+            m_t2,
+            z.p_11 + ekf.walk_1,
+            z.p_12,
+            z.p_22 + ekf.walk_2,
+        ),
+    )
+
+
+@law
+def correct_with_slip(
+    e: Estimate, z: SlipEstimate, ekf: SlipEkf, x: float, y: float
+) -> tuple[Estimate, SlipEstimate, float, float, float]:
+    """Update with a position fix (mm); the slip estimates are held within their bounds.
+
+    Returns the estimates, the innovation in world axes (mm), and its normalised square (NIS).
+    """
+    s_xx, s_xy, s_yy = e.p_xx + ekf.variance, e.p_xy, e.p_yy + ekf.variance
+    det = s_xx * s_yy - s_xy * s_xy
+    i_xx, i_xy, i_yy = s_yy / det, -s_xy / det, s_xx / det
+    d_x, d_y = x - e.x, y - e.y
+    # Gain l = P Hᵀ S⁻¹, rows x, y, θ, δ₁, δ₂.
+    l_xx, l_xy = e.p_xx * i_xx + e.p_xy * i_xy, e.p_xx * i_xy + e.p_xy * i_yy
+    l_yx, l_yy = e.p_xy * i_xx + e.p_yy * i_xy, e.p_xy * i_xy + e.p_yy * i_yy
+    l_tx, l_ty = e.p_xt * i_xx + e.p_yt * i_xy, e.p_xt * i_xy + e.p_yt * i_yy
+    l_1x, l_1y = z.p_x1 * i_xx + z.p_y1 * i_xy, z.p_x1 * i_xy + z.p_y1 * i_yy
+    l_2x, l_2y = z.p_x2 * i_xx + z.p_y2 * i_xy, z.p_x2 * i_xy + z.p_y2 * i_yy
+    delta_1 = z.delta_1 + l_1x * d_x + l_1y * d_y
+    delta_2 = z.delta_2 + l_2x * d_x + l_2y * d_y
+    return (
+        Estimate(
+            e.x + l_xx * d_x + l_xy * d_y,
+            e.y + l_yx * d_x + l_yy * d_y,
+            e.theta + l_tx * d_x + l_ty * d_y,
+            e.p_xx - l_xx * e.p_xx - l_xy * e.p_xy,
+            e.p_xy - l_xx * e.p_xy - l_xy * e.p_yy,
+            e.p_xt - l_xx * e.p_xt - l_xy * e.p_yt,
+            e.p_yy - l_yx * e.p_xy - l_yy * e.p_yy,
+            e.p_yt - l_yx * e.p_xt - l_yy * e.p_yt,
+            e.p_tt - l_tx * e.p_xt - l_ty * e.p_yt,
+        ),
+        SlipEstimate(
+            min(max(delta_1, -ekf.bound_1), ekf.bound_1),
+            min(max(delta_2, -ekf.bound_2), ekf.bound_2),
+            z.p_x1 - l_xx * z.p_x1 - l_xy * z.p_y1,
+            z.p_y1 - l_yx * z.p_x1 - l_yy * z.p_y1,
+            z.p_t1 - l_tx * z.p_x1 - l_ty * z.p_y1,
+            z.p_x2 - l_xx * z.p_x2 - l_xy * z.p_y2,
+            z.p_y2 - l_yx * z.p_x2 - l_yy * z.p_y2,
+            z.p_t2 - l_tx * z.p_x2 - l_ty * z.p_y2,
+            z.p_11 - l_1x * z.p_x1 - l_1y * z.p_y1,
+            z.p_12 - l_1x * z.p_x2 - l_1y * z.p_y2,
+            z.p_22 - l_2x * z.p_x2 - l_2y * z.p_y2,
+        ),
+        d_x,
+        d_y,
+        d_x * (i_xx * d_x + i_xy * d_y) + d_y * (i_xy * d_x + i_yy * d_y),
+    )
