@@ -13,11 +13,13 @@ from baselines import ReferencePolicy
 from tlf_env.envs.parallel import parallel_env
 from tlf_env.onboard.parts import part_name
 from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.state import Motion
 from tlf_env.task.arrays import Info, Sample
 from tlf_env.task.channels import CHANNELS, NOMINAL_NOISE_MM, PATHS, STEP_CHANNELS, number
 from tlf_env.task.disturbance import Disturbance, loaded
 from tlf_env.task.formation import Formation
-from tlf_env.task.radio import message_slot
+from tlf_env.task.observation import SENSOR_TAIL_ENTRIES
+from tlf_env.task.radio import delayed_message
 from tlf_env.task.scenario import load_scenario, preset_names, presets_folder
 from tlf_env.task.settings import settings
 
@@ -118,6 +120,9 @@ def run(channels=None, seconds=3.0, level=1.0, actions=None, **overrides):
 @functools.cache
 def nominal(seconds=3.0):
     return run(seconds=seconds)
+
+
+SLIPPING = {"slip.delta_1_mm_s": 12.0, "slip.delta_2_rad_s": 0.1}
 
 
 def constant(*action):
@@ -520,12 +525,14 @@ def ages(found, robot=1, count=2000):
     formation = found.formation
     a, s = formation.arrays, settings(formation.scenario)
     slots = a.messages.shape[1]
+    a.messages[:] = 0.0
     out = []
     for step in range(100, 100 + count):
         a.clock[0, 1] = step
-        slot = message_slot(a, 0, robot, step, s)
-        out.append((step - s.gap - slot) % slots)
-    return np.array(out)
+        for sent in range(step - slots + 1, step + 1):  # at rest, so that dead reckoning leaves x
+            a.messages[0, sent % slots, robot - 1, 0] = sent
+        out.append(step - s.gap - delayed_message(a, 0, robot, step, s).x)
+    return np.array(out, dtype=int)
 
 
 def test_the_dropout_is_the_share_of_messages_that_never_arrive():
@@ -535,8 +542,20 @@ def test_the_dropout_is_the_share_of_messages_that_never_arrive():
     assert pairs.mean() == pytest.approx(0.09, abs=0.02)  # one after the other independently
 
 
+def rounded(theta, distance, turn):
+    """Way in world axes on the arc of a length and a turn, by the closed form of eq. (1)."""
+    if abs(turn) < 1e-9:
+        return np.array([-math.sin(theta), math.cos(theta)]) * distance
+    end = theta + turn
+    return (
+        distance
+        / turn
+        * np.array([math.cos(end) - math.cos(theta), math.sin(end) - math.sin(theta)])
+    )
+
+
 @pytest.mark.parametrize("dropout", [0.3, 0.95, 0.999])
-def test_a_follower_holds_the_last_message_that_arrived(dropout):
+def test_a_follower_goes_on_from_the_last_message_that_arrived(dropout):
     found = run(
         {"radio.dropout": dropout},
         seconds=12.0,
@@ -545,19 +564,87 @@ def test_a_follower_holds_the_last_message_that_arrived(dropout):
         time_gap_s=1.0,
         preview_s=(),
     )
-    tail = found.seen[:, :, -12:]
-    scale = found.formation.arrays.sensor_scales[-12:]
-    heard = tail[:, 1, 5] * scale[5] + found.starts[1, 0]  # x of the message that robot_1 uses
-    start = found.starts[0, 0]
-    sent = np.concatenate([[start], found.message[:, 0, 0]])
+    first = [*SENSOR_TAIL_ENTRIES].index("message_x") - len(SENSOR_TAIL_ENTRIES)
+    scale = found.formation.arrays.sensor_scales[[first, first + 1]]
+    heard = found.seen[:, 1, [first, first + 1]] * scale + found.starts[1, :2]  # by robot_1
+    sent = np.concatenate([[[*found.starts[0], 0.0, 0.0]], found.message[:, 0]])
     arrived = np.concatenate([[True], ~found.dropped[:, 0]])
     expected = []
     for step in range(1, len(heard) + 1):
-        k = max(step - 50, 0)
+        newest = max(step - 50, 0)
+        k = newest
         while not arrived[k]:
             k -= 1
-        expected.append(sent[k])
+        ago = (newest - k) * 0.02
+        x, y, theta, u_1, u_2 = sent[k]
+        expected.append(np.array([x, y]) + rounded(theta, u_1 * ago, u_2 * ago))
     assert heard == pytest.approx(np.array(expected), abs=1e-6)
+
+
+def steady(channels):
+    """From rest at once to one constant twist: the kinematic plant."""
+    return run(
+        channels,
+        seconds=6.0,
+        actions=constant([0.3, 0.0]),
+        plant="kinematic",
+        estimator="truth",
+        observation="sensor",
+        dtype="float64",
+        time_gap_s=1.0,
+        preview_s=(),
+    )
+
+
+@pytest.mark.parametrize(
+    "channels", [{"radio.dropout": 0.3}, {"radio.jitter_s": 0.3}, SLIPPING | {"radio.dropout": 0.3}]
+)
+def test_lost_and_late_messages_change_nothing_while_the_sender_keeps_its_twist(channels):
+    """On a line, and on a circle; from the first message on that tells the speed."""
+    perfect = {path: value for path, value in channels.items() if not path.startswith("radio")}
+    heard, expected = steady(channels).seen[:, 1], steady(perfect).seen[:, 1]
+    np.testing.assert_allclose(heard[80:], expected[80:], rtol=0, atol=1e-9)
+    assert np.abs(expected[80:]).max() > 0.1
+
+
+@pytest.mark.parametrize("action", [(0.3, 0.0), (0.2, 0.05), (0.0, -0.1), (-0.2, 0.1)])
+def test_truth_broadcasts_the_true_motion_whatever_the_encoders_say(action):
+    found = run(
+        SLIPPING | {"encoder.quantum_rad": 0.02, "encoder.noise_std_rad": 0.01},
+        seconds=2.0,
+        actions=constant(action),
+        estimator="truth",
+        plant="kinematic",
+    )
+    u_1 = 1000.0 * action[0] + SLIPPING["slip.delta_1_mm_s"]
+    u_2 = 8.0 * action[1] + SLIPPING["slip.delta_2_rad_s"]
+    assert found.message[:, :, 3] == pytest.approx(u_1, abs=1e-9)
+    assert found.message[:, :, 4] == pytest.approx(u_2, abs=1e-9)
+    one = found.formation.arrays.slip_estimates[:2, :, 0]
+    assert one == pytest.approx(np.array([[v] * 3 for v in SLIPPING.values()]), abs=1e-9)
+
+
+def test_truth_broadcasts_the_true_motion_of_a_robot_that_skids():
+    found = run({"tyre.friction_scale": 0.2}, seconds=3.0, estimator="truth")
+    theta, v_x, v_y, w = (
+        found.motion[:, :, Motion._fields.index(name)] for name in ("theta", "v_x", "v_y", "w")
+    )
+    forward = v_y * np.cos(theta) - v_x * np.sin(theta)
+    assert found.message[:, :, 3] == pytest.approx(forward, abs=1e-12)
+    assert (found.message[:, :, 4] == w).all()
+
+
+def test_with_the_slip_aware_filter_the_estimated_slip_goes_on_the_air():
+    """Odometry does not see the conveyor; the message does, once the filter has found it."""
+    channels = SLIPPING | {"position.noise_std_mm": 0.4472}
+    odometry, both = (
+        run(channels, seconds=8.0, actions=constant([0.3, 0.0]), estimator=estimator)
+        for estimator in ("ekf", "ekf-slip")
+    )
+    assert (odometry.motion == both.motion).all()
+    told = (both.message - odometry.message)[-100:, :, 3:].mean(axis=0)
+    assert told[:, 0] == pytest.approx(SLIPPING["slip.delta_1_mm_s"], abs=0.5)
+    assert told[:, 1] == pytest.approx(SLIPPING["slip.delta_2_rad_s"], abs=0.02)
 
 
 @pytest.mark.parametrize("steps", [1, 5, 50])

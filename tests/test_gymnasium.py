@@ -21,6 +21,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 import tlf_env
 from baselines import ReferencePolicy
 from tlf_env.envs.single import FormationEnv
+from tlf_env.task.observation import tracking_entries
 from tlf_env.task.trajectories import sample
 
 pettingzoo_test = pytest.importorskip(
@@ -355,7 +356,7 @@ def test_others_are_asked_as_sb3_asks(action: str, observation: str) -> None:
     for _ in range(2):
         env.reset(seed=0)
         list(steps_of(env, random_actions(env, 3)))
-    rows = (3, 33)
+    rows = (3, len(tracking_entries(env.scenario.preview_s)))
     first, later = [True] * 3, [False] * 3
     episode = [(rows, None, first, True), (rows, 1, later, True), (rows, 2, later, True)]
     assert others.calls == 2 * episode

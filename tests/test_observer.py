@@ -12,7 +12,13 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 import tlf_env
-from tlf_env.onboard.observer import Message, observed_reference, observer_rates, smoothing
+from tlf_env.onboard.observer import (
+    Message,
+    dead_reckoned,
+    observed_reference,
+    observer_rates,
+    smoothing,
+)
 from tlf_env.task.observation import TRACKING_ENTRIES, Tracking, tracking_entries
 
 B, SMOOTHING_S = 3.0, 5.0  # the paper's
@@ -265,3 +271,40 @@ def test_a_followers_reference_moves_with_its_twist():
             u_1, u_2 = entry(seen[i], "reference_u_1"), entry(seen[i], "reference_u_2")
             assert math.hypot(*rates[i, :2]) == pytest.approx(u_1, rel=1e-5, abs=1e-3)
             assert rates[i, 2] == pytest.approx(u_2, rel=1e-5, abs=1e-5)
+
+
+# Dead reckoning over what the radio lost
+
+
+@untimed
+@given(places, places, headings, speeds, turns, st.floats(0, 2))
+def test_dead_reckoning_is_the_integral_of_the_twist(x, y, theta, u_1, u_2, duration):
+    """On a line or a circle, against fine steps of Runge and Kutta's fourth order."""
+
+    def rate(t: float) -> np.ndarray:
+        return np.array([-u_1 * math.sin(theta + u_2 * t), u_1 * math.cos(theta + u_2 * t)])
+
+    place, step = np.array([x, y]), duration / 100
+    for k in range(100):
+        t = k * step
+        place = place + step / 6 * (rate(t) + 4 * rate(t + step / 2) + rate(t + step))
+    found = dead_reckoned(Message(x, y, theta, u_1, u_2), duration)
+    np.testing.assert_allclose(found[:2], place, rtol=0, atol=1e-6)
+    assert found[2:] == (theta + u_2 * duration, u_1, u_2)
+
+
+@untimed
+@given(headings, speeds, turns, st.floats(0, 2), st.floats(0, 2))
+def test_dead_reckoning_in_two_steps_is_that_in_one(theta, u_1, u_2, first, second):
+    message = Message(100.0, -50.0, theta, u_1, u_2)
+    found = dead_reckoned(dead_reckoned(message, first), second)
+    np.testing.assert_allclose(found, dead_reckoned(message, first + second), rtol=0, atol=1e-9)
+    assert dead_reckoned(message, 0.0) == message
+
+
+@pytest.mark.parametrize("turn", [0.0, 1e-12, 1e-5, 1.9e-4, 2.1e-4, 1e-3])
+def test_dead_reckoning_is_smooth_where_the_circle_becomes_a_line(turn):
+    half = turn / 2
+    chord = 500.0 * (1 - half**2 / 6 + half**4 / 120)
+    found = dead_reckoned(Message(0.0, 0.0, 0.0, 500.0, turn), 1.0)
+    assert math.hypot(found.x, found.y) == pytest.approx(chord, rel=1e-15)

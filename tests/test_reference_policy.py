@@ -17,6 +17,7 @@ ENTRIES = len(Tracking._fields)
 NEEDED = ("e_1", "e_2", "sin_e_3", "cos_e_3", "reference_u_1", "reference_u_2")
 
 presets = pytest.mark.parametrize("preset", ["consistent", "printed"])
+every = pytest.mark.parametrize("preset", ["consistent", "printed", "tuned"])
 
 
 def batch(rows: int = 64, entries: int = ENTRIES, seed: int = 0) -> np.ndarray:
@@ -58,7 +59,7 @@ def test_action_is_the_law_at_the_formations_estimates(preset):
     assert compared > 0.99 * 800 * 3
 
 
-@presets
+@every
 def test_prediction_is_a_pure_function_of_the_observation(preset):
     policy, rows = ReferencePolicy(preset), batch()
     kept = rows.copy()
@@ -70,7 +71,7 @@ def test_prediction_is_a_pure_function_of_the_observation(preset):
     assert rows.tobytes() == kept.tobytes()
 
 
-@presets
+@every
 def test_a_batch_is_its_rows_one_by_one(preset):
     policy, rows = ReferencePolicy(preset), batch()
     together, _ = policy.predict(rows)
@@ -116,7 +117,7 @@ def test_what_is_no_tracking_observation_is_refused(shape):
 
 
 def test_unknown_gains_are_refused_naming_the_presets():
-    with pytest.raises(ValueError, match=r"bold.*consistent.*printed"):
+    with pytest.raises(ValueError, match=r"bold.*consistent.*printed.*tuned"):
         ReferencePolicy("bold")
 
 

@@ -89,6 +89,12 @@ def conveyor(delta_1: float, delta_2: float, half_width: float) -> tuple[float, 
 
 
 @law
+def forward_and_yaw(motion: Motion) -> tuple[float, float]:
+    """Speed along the heading (mm/s), the same for every point of the robot's axis, and yaw rate (rad/s)."""
+    return motion.v_y * math.cos(motion.theta) - motion.v_x * math.sin(motion.theta), motion.w
+
+
+@law
 def advance_pose(motion: Motion, dt: float) -> Motion:
     """Pose one substep on, added up exactly as Chipmunk does: p + v·dt, θ + w·dt."""
     return Motion(

@@ -41,7 +41,11 @@ ACTION_ENTRIES = {
         Entry("torque on the right wheel", "N·mm", FULL_TORQUE_NMM),
     ),
     "residual": (
-        Entry("forward speed added to the twist of residual_base", "mm/s", FULL_RESIDUAL_MM_S),
+        Entry(
+            "forward speed added to what residual_base asks for, before its limits",
+            "mm/s",
+            FULL_RESIDUAL_MM_S,
+        ),
         Entry("yaw rate added to it", "rad/s", FULL_RESIDUAL_RAD_S),
     ),
 }

@@ -134,7 +134,7 @@ def transmit_lane(a: Arrays, lane: int, s: Settings) -> None:
     step = a.clock[lane, 1] + 1
     a.clock[lane, 1] = step
     for r in range(a.motions.shape[1]):
-        broadcast(a, lane, r, step, s.period)
+        broadcast(a, lane, r, step, s)
         record_truth(a, lane, r, step)
 
 
@@ -262,7 +262,7 @@ def begin(a: Arrays, lane: int, s: Settings) -> None:
     """After the poses of a lane are set: first messages, and references up to the preview."""
     robots = a.motions.shape[1]
     for r in range(robots):
-        broadcast(a, lane, r, 0, s.period)
+        broadcast(a, lane, r, 0, s)
         record_truth(a, lane, r, 0)
     for r in range(robots):
         if r == 0 or not s.external_observer:

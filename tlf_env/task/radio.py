@@ -15,32 +15,34 @@ from tlf_env.onboard.observer import (
     smoothing,
 )
 from tlf_env.onboard.slip_estimator import SlipEstimate
+from tlf_env.physics.state import forward_and_yaw, read_motion
 from tlf_env.task.arrays import Arrays, read_trace
 from tlf_env.task.channels import DROPOUT, JITTER, RADIO_DROPOUT, RADIO_JITTER
-from tlf_env.task.settings import Settings
+from tlf_env.task.settings import TRUTH, Settings
 
 DELTA_1 = SlipEstimate._fields.index("delta_1")
 DELTA_2 = SlipEstimate._fields.index("delta_2")
-
 
 read_message = slot_reader(Message)
 write_message = slot_writer(Message)
 
 
 @block
-def broadcast(a: Arrays, lane: int, r: int, step: int, period: float) -> None:
+def broadcast(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     """Put robot ``r``'s estimated pose and twist (odometry and estimated slip) on the air.
 
-    If the broadcast is lost, whoever listens goes on from the last message, by dead reckoning.
+    With the estimator ``truth`` it is the true twist at the step's end. If the broadcast is lost,
+    whoever listens goes on from the last message, by dead reckoning.
     """
     slot = step % a.messages.shape[1]
-    trace = read_trace(a.traces, r, lane)
+    if s.estimator == TRUTH:
+        u_1, u_2 = forward_and_yaw(read_motion(a.motions, r, lane))
+    else:
+        trace = read_trace(a.traces, r, lane)
+        u_1 = trace.distance / s.period + a.slip_estimates[DELTA_1, r, lane]
+        u_2 = trace.turn / s.period + a.slip_estimates[DELTA_2, r, lane]
     message = Message(
-        a.estimates[0, r, lane],
-        a.estimates[1, r, lane],
-        a.estimates[2, r, lane],
-        trace.distance / period + a.slip_estimates[DELTA_1, r, lane],
-        trace.turn / period + a.slip_estimates[DELTA_2, r, lane],
+        a.estimates[0, r, lane], a.estimates[1, r, lane], a.estimates[2, r, lane], u_1, u_2
     )
     dropout = a.applied[DROPOUT, r, lane]
     lost = False
@@ -50,7 +52,7 @@ def broadcast(a: Arrays, lane: int, r: int, step: int, period: float) -> None:
     a.dropped[slot, r, lane] = lost
     if lost:
         before = (step - 1) % a.messages.shape[1]
-        message = dead_reckoned(read_message(a.messages, before, r, lane), period)
+        message = dead_reckoned(read_message(a.messages, before, r, lane), s.period)
     write_message(a.messages, slot, r, lane, message)
 
 

@@ -126,7 +126,7 @@ class Scenario(Frozen):
     adversary: bool = False  # whether something outside may set channels at every step
 
     action: Literal["twist", "wheel_speed", "torque", "residual"] = "twist"
-    residual_base: str = "consistent"  # gains of the tracking law that a residual is added to
+    residual_base: str = "consistent"  # controller that a residual is added to, a preset
     observation: Literal["tracking", "sensor"] = "tracking"
     dtype: Literal["float32", "float64"] = "float32"  # of observations and actions
     preview_s: tuple[NonNegative, ...] = DEFAULT_PREVIEW_S

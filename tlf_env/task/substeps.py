@@ -51,6 +51,7 @@ from tlf_env.physics.state import (
     advance_pose,
     axle_midpoint,
     conveyor,
+    forward_and_yaw,
     read_body,
     read_contact,
     read_motion,
@@ -210,12 +211,10 @@ def sense_robot(
         estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y)
     elif kind == TRUTH:
         true_x, true_y = axle_midpoint(motion, body.d)
-        turned = motion.theta - estimate.theta
-        moved, _ = body_errors(
-            true_x - estimate.x, true_y - estimate.y, estimate.theta + 0.5 * turned
-        )
-        unknown = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-        slip = SlipEstimate((moved - u_1) / dt, (turned - u_2) / dt, *unknown)
+        ahead, yaw = forward_and_yaw(motion)
+        rolled, spun = odometry(motion.omega_l, motion.omega_r, body.R, body.h)
+        certain = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        slip = SlipEstimate(ahead - rolled, yaw - spun, *certain)
         estimate = Estimate(true_x, true_y, motion.theta, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     forward, right = body_errors(d_x, d_y, estimate.theta)
     return (
