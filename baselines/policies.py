@@ -12,7 +12,7 @@ from baselines.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.reference import ReferencePolicy
 from baselines.run import Policy
 from tlf_env.onboard.parts import load_part
-from tlf_env.onboard.tracking import GAIN_PRESETS
+from tlf_env.onboard.tracking import CONTROLLERS
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import Scenario, load_scenario
@@ -35,7 +35,7 @@ class Entry(NamedTuple):
 
 def policy_names() -> list[str]:
     """The names of the policies that are not learned; they need no file."""
-    return [*(f"reference:{gains}" for gains in GAIN_PRESETS), *CLASSICAL]
+    return [*(f"reference:{gains}" for gains in CONTROLLERS), *CLASSICAL]
 
 
 def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy:
@@ -120,7 +120,7 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     head, _, tail = name.partition(":")
     if head == "reference":
         fits(name, scenario, action="twist", observation="tracking")
-        return ReferencePolicy(tail or "consistent")
+        return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
     if head in CLASSICAL and not tail:
         fits(name, scenario, action="twist", observation="tracking")
         return CLASSICAL[head](scenario.preview_s)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -34,15 +35,18 @@ class ReferencePolicy:
         ``"consistent"`` (k₂ = 0.83·k₃), ``"printed"`` (k₂ = 0.83 mm²/s), ``"tuned"`` (other gains,
         and limits on the twist), :class:`TrackingGains` or :class:`Controller`.
     control_period_s
-        Period at which it acts: limits on accelerations need it.
+        Period at which it acts, s: limits on accelerations need it.
+    preview_s
+        The scenario's previews, s: a lead is made from the first.
 
     Raises
     ------
     ValueError
-        for an unknown preset.
+        for an unknown preset, and for a lead without a first preview above 0.
     """
 
     privileged = False
+    scenario_overrides: Mapping[str, Any] = {}  # an estimate of the slip, if it is to be cancelled
 
     def __init__(
         self,
@@ -58,6 +62,9 @@ class ReferencePolicy:
             self.controller = gains
         self._scales = np.array([entry.scale for entry in tracking_entries(preview_s).values()])
         self._row = controller_row(self.controller, control_period_s, preview_s)
+        self._needed = len(self._scales) if self.controller.lead_s else len(Tracking._fields)
+        if self.controller.limits.cancel_slip:
+            self.scenario_overrides = {"estimator": "ekf-slip"}
 
     def predict(
         self,
@@ -77,10 +84,10 @@ class ReferencePolicy:
             if the observation is not a ``tracking`` observation.
         """
         observation = np.asarray(observation)
-        if observation.ndim not in (1, 2) or observation.shape[-1] < len(Tracking._fields):
+        if observation.ndim not in (1, 2) or observation.shape[-1] < self._needed:
             raise ValueError(
                 f"the observation has the shape {observation.shape}; a tracking observation has at "
-                f"least {len(Tracking._fields)} entries, in one row or a batch of rows"
+                f"least {self._needed} entries, in one row or a batch of rows"
             )
         rows = np.ascontiguousarray(np.atleast_2d(observation))
         action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)

@@ -24,7 +24,15 @@ from tlf_env.onboard.estimator import (
     write_estimate,
 )
 from tlf_env.onboard.observer import Message, observed_reference, observer_rates, smoothing
-from tlf_env.onboard.tracking import Gains, body_errors, gains_row, tracking_gains, tracking_twist
+from tlf_env.onboard.tracking import (
+    CONTROLLERS,
+    GAIN_PRESETS,
+    Gains,
+    body_errors,
+    gains_row,
+    tracking_gains,
+    tracking_twist,
+)
 from tlf_env.onboard.wheel_loop import (
     WheelLoop,
     WheelLoopState,
@@ -165,7 +173,13 @@ class StackPolicy:
     scenario
         The scenario that it will run on: periods and the stack's parameters are read from it.
     gains
-        A preset's name.
+        A preset of the paper's law, ``"consistent"`` or ``"printed"``.
+
+    Raises
+    ------
+    ValueError
+        for other gains (the stack has neither limits nor an estimate of the slip), and if the
+        scenario names parts of its own.
     """
 
     privileged = False
@@ -175,6 +189,11 @@ class StackPolicy:
         if isinstance(wheel_loop, str) or isinstance(observer, str):
             raise ValueError(
                 "StackPolicy has the paper's wheel loop and observer; the scenario names parts"
+            )
+        if gains in CONTROLLERS and gains not in GAIN_PRESETS:
+            raise ValueError(
+                f"StackPolicy has the paper's law and filter, gains {', '.join(GAIN_PRESETS)}; "
+                f"{gains!r} needs limits and an estimate of the slip"
             )
         self._entries = sensor_entries(scenario.substeps)
         self._scales = np.array([entry.scale for entry in self._entries.values()])

@@ -3,8 +3,10 @@
 import numpy as np
 import pytest
 
-from baselines.policies import make_policy, policy_names
+from baselines.policies import enter, make_policy, policy_names
 from baselines.run import run_policy
+from baselines.stack import StackPolicy
+from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import load_scenario
 
 SCENARIO = load_scenario(horizon_s=0.2)
@@ -40,6 +42,51 @@ def test_every_name_makes_a_policy_that_drives(name):
 def test_an_unknown_name_is_told(name):
     with pytest.raises(ValueError, match=r"^[^\n]+$"):
         make_policy(name, SCENARIO)
+
+
+def test_the_tuned_reference_runs_on_an_estimate_of_the_slip():
+    assert "reference:tuned" in policy_names()
+    entry = enter("reference:tuned", SCENARIO)
+    assert entry.overrides == {"estimator": "ekf-slip"}
+    assert entry.scenario == load_scenario(SCENARIO, estimator="ekf-slip")
+    for name in ("reference", "reference:printed"):
+        assert enter(name, SCENARIO).overrides == {}
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "truth", "ekf-slip"])
+def test_an_estimator_that_is_set_stands(estimator):
+    entry = enter("reference:tuned", load_scenario(horizon_s=0.2, estimator=estimator))
+    assert (entry.overrides, entry.scenario.estimator) == ({}, estimator)
+
+
+def test_the_reference_has_the_scenarios_period():
+    """A limit on an acceleration is a step of the command, as long as the period."""
+    seen = np.zeros(len(tracking_entries((1.0,))), dtype=np.float64)
+    seen[:4] = 1.0, 0.0, 0.0, 1.0  # the reference is far ahead
+    for period_s in (0.01, 0.02):
+        scenario = load_scenario(control_period_s=period_s, preview_s=(1.0,), estimator="ekf-slip")
+        action, _ = make_policy("reference:tuned", scenario).predict(seen)
+        assert action[0] == pytest.approx(150.0 * period_s / 1000.0)
+
+
+def test_a_residual_is_added_to_the_tuned_reference():
+    scenario = load_scenario(SCENARIO, action="residual", residual_base="tuned")
+    record = run_policy(scenario, AlwaysStill())
+    assert np.isfinite(record["x_mm"]).all()
+
+
+class AlwaysStill:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2)), state
+
+
+def test_the_stack_has_the_papers_law_alone():
+    fields = {"observation": "sensor", "action": "torque", "control_period_s": 0.001}
+    scenario = load_scenario(**fields)
+    with pytest.raises(ValueError, match=r"gains consistent, printed; 'tuned' needs limits"):
+        StackPolicy(scenario, "tuned")
+    with pytest.raises(ValueError, match=r"'bold' is not one of consistent, printed$"):
+        StackPolicy(scenario, "bold")
 
 
 @pytest.mark.parametrize("name", policy_names())

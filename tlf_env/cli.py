@@ -68,10 +68,12 @@ def run(
         ),
     ] = "reference",
     gains: Annotated[
-        str | None, typer.Option(help="Gains of the reference: consistent (default), printed.")
+        str | None,
+        typer.Option(help="Gains of the reference: consistent (default), printed, tuned."),
     ] = None,
     estimator: Annotated[
-        str | None, typer.Option(help="ekf, truth (privileged), or module:factory.")
+        str | None,
+        typer.Option(help="ekf (the paper's), ekf-slip, truth (privileged), or module:factory."),
     ] = None,
     wheel_loop: Annotated[str | None, typer.Option(help="module:factory of a wheel loop.")] = None,
     observer: Annotated[str | None, typer.Option(help="module:factory of an observer.")] = None,
