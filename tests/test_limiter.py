@@ -1,0 +1,294 @@
+"""Limits on the twist, the lead, and the controller that has them: from outside, on board, under a residual."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from helpers import stacked, unstacked, untimed
+from hypothesis import given
+from hypothesis import strategies as st
+
+import tlf_env
+from baselines import ReferencePolicy
+from tlf_env.envs.single import FormationEnv
+from tlf_env.onboard.estimator import odometry
+from tlf_env.onboard.limiter import (
+    TwistLimits,
+    limited_twist,
+    limits_row,
+    saturated_error,
+)
+from tlf_env.onboard.tracking import (
+    CONTROLLERS,
+    Controller,
+    TrackingGains,
+    controller,
+    controller_row,
+    gains_row,
+    tracking_twist,
+)
+from tlf_env.physics.parameters import body
+from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
+from tlf_env.task.formation import Formation
+from tlf_env.task.observation import TRACKING_ENTRIES, Preview, Tracking, tracking_entries
+from tlf_env.task.scenario import load_scenario
+
+PERIOD_S = 0.02
+PREVIEW_S = (0.5, 1.0)
+ENTRIES = len(tracking_entries(PREVIEW_S))
+SCALES = np.array([entry.scale for entry in tracking_entries(PREVIEW_S).values()])
+NONE = limits_row(TwistLimits(), PERIOD_S)
+TUNED = controller("tuned").limits
+ALL = limits_row(TUNED, PERIOD_S)
+PAPERS = [name for name in CONTROLLERS if name != "tuned"]
+
+speeds = st.floats(-2000, 2000)
+yaws = st.floats(-20, 20)
+twists = st.tuples(speeds, yaws)
+slips = st.tuples(st.floats(-60, 60), st.floats(-0.4, 0.4))
+
+
+def place(name: str) -> int:
+    return Tracking._fields.index(name)
+
+
+def batch(rows: int = 64, seed: int = 0) -> np.ndarray:
+    return np.random.default_rng(seed).uniform(-1, 1, (rows, ENTRIES)).astype(np.float32)
+
+
+# The limiter
+
+
+@untimed
+@given(twists, twists, slips)
+def test_without_limits_the_twist_is_left_bit_for_bit(u, last, slip):
+    assert limited_twist(*u, *last, *slip, NONE) == u
+    assert saturated_error(u[0], NONE) == u[0]
+
+
+@pytest.mark.parametrize("name", PAPERS)
+def test_without_limits_the_policy_is_the_papers_law_bit_for_bit(name):
+    seen, gains = batch(500), gains_row(controller(name).gains)
+    expected = np.empty((len(seen), 2), dtype=np.float32)
+    for row, out in zip(seen, expected, strict=True):
+        values = [
+            float(row[place(entry)]) * TRACKING_ENTRIES[entry].scale
+            for entry in ("e_1", "e_2", "sin_e_3", "cos_e_3", "reference_u_1", "reference_u_2")
+        ]
+        u_1, u_2 = tracking_twist(*values, gains)
+        out[0] = min(max(u_1 / FULL_SPEED_MM_S, -1.0), 1.0)
+        out[1] = min(max(u_2 / FULL_YAW_RATE_RAD_S, -1.0), 1.0)
+    assert ReferencePolicy(name).predict(seen)[0].tobytes() == expected.tobytes()
+
+
+@untimed
+@given(twists, twists, slips)
+def test_limits_hold(u, last, slip):
+    """Of the body's twist, the wheels' plus the slip; turning gives way before the speed."""
+    v_1, v_2 = limited_twist(*u, *last, *slip, ALL)
+    b_1, b_2 = v_1 + slip[0], v_2 + slip[1]
+    assert abs(v_1 - last[0]) <= ALL.step_1 + 1e-9
+    assert abs(b_1 * b_2) <= ALL.lateral * (1 + 1e-9) + 1e-9
+    if abs(v_2 - last[1]) > ALL.step_2 + 1e-9:
+        assert abs(b_1 * b_2) == pytest.approx(ALL.lateral, rel=1e-6)
+        assert abs(b_2) < abs(last[1] + slip[1])
+
+
+@untimed
+@given(twists, twists, slips)
+def test_limiting_a_limited_twist_changes_nothing(u, last, slip):
+    v_1, v_2 = limited_twist(*u, *last, *slip, ALL)
+    again = limited_twist(v_1 + slip[0], v_2 + slip[1], *last, *slip, ALL)
+    assert again == pytest.approx((v_1, v_2), rel=1e-12, abs=1e-9)
+
+
+@untimed
+@given(st.floats(-100, 100), st.floats(-0.4, 0.4), slips)
+def test_what_is_within_the_limits_is_left_but_for_the_slip(u_1, u_2, slip):
+    last = u_1 - slip[0] + 0.5 * ALL.step_1, u_2 - slip[1] - 0.5 * ALL.step_2
+    assert limited_twist(u_1, u_2, *last, *slip, ALL) == (u_1 - slip[0], u_2 - slip[1])
+
+
+@untimed
+@given(twists, twists, slips)
+def test_limits_are_the_same_to_the_left_and_to_the_right_and_back_and_forth(u, last, slip):
+    v_1, v_2 = limited_twist(*u, *last, *slip, ALL)
+    for turn, way in ((-1.0, 1.0), (1.0, -1.0)):
+        mirrored = [
+            sign * value
+            for pair in (u, last, slip)
+            for sign, value in zip((way, turn), pair, strict=True)
+        ]
+        assert limited_twist(*mirrored, ALL) == (way * v_1, turn * v_2)
+
+
+@untimed
+@given(st.floats(-5000, 5000), st.floats(-5000, 5000))
+def test_the_forward_error_saturates_smoothly(e, other):
+    assert abs(saturated_error(e, ALL)) <= min(abs(e) + 1e-12, TUNED.forward_error_mm)
+    assert saturated_error(-e, ALL) == -saturated_error(e, ALL)
+    assert (saturated_error(e, ALL) - saturated_error(other, ALL)) * (e - other) >= 0
+    assert saturated_error(1.0, ALL) == pytest.approx(1.0, rel=1e-5)
+
+
+def test_limits_on_accelerations_are_per_second():
+    half = limits_row(TUNED, PERIOD_S / 2)
+    assert (2 * half.step_1, 2 * half.step_2) == (ALL.step_1, ALL.step_2)
+    assert half.lateral == ALL.lateral
+
+
+@pytest.mark.parametrize("field", [name for name in TwistLimits.model_fields if "_mm" in name])
+@pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
+def test_impossible_limits_are_refused(field, value):
+    with pytest.raises(ValueError, match=field):
+        TwistLimits(**{field: value})
+
+
+# The whole loop
+
+
+@pytest.mark.parametrize("disturbance", ["nominal", "combined-hard"])
+def test_limits_hold_on_every_command_of_an_episode(disturbance):
+    """Observations and actions are float32."""
+    scenario = load_scenario(
+        "infinity", disturbance=disturbance, estimator="ekf-slip", horizon_s=40.0, end_on=()
+    )
+    formation = Formation(scenario)
+    formation.reset(3)
+    a, policy, robot = formation.arrays, ReferencePolicy("tuned"), body(scenario.robot)
+    last, at_limit = np.zeros((2, 3)), np.zeros(3, dtype=int)
+    for _ in range(scenario.horizon_steps):
+        slip = a.slip_estimates[:2, :, 0].copy()
+        a.actions[0] = policy.predict(a.observations[0])[0]
+        formation.step()
+        twist = np.array(odometry(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h))
+        step, lateral = np.abs(twist - last), np.abs(np.prod(twist + slip, axis=0))
+        assert (step[0] <= ALL.step_1 + 1e-3).all()
+        assert (lateral <= ALL.lateral + 0.05).all()
+        gives_way = step[1] > ALL.step_2 + 1e-5
+        assert (lateral[gives_way] >= ALL.lateral - 0.05).all()
+        at_limit[0] += np.count_nonzero(step[0] > ALL.step_1 - 1e-3)
+        at_limit[1] += np.count_nonzero(step[1] > ALL.step_2 - 1e-5)
+        at_limit[2] += np.count_nonzero(lateral > ALL.lateral - 0.05)
+        last = twist
+    assert at_limit[0] > 0
+    assert at_limit[2] > 0
+
+
+@pytest.mark.parametrize("base", ["tuned", "consistent"])
+def test_a_residual_of_zero_is_the_base_run_as_a_twist(base):
+    fields = {"estimator": "ekf-slip", "disturbance": "combined-medium", "end_on": ()}
+    policy = ReferencePolicy(base)
+    one = Formation(load_scenario("infinity", action="twist", **fields))
+    other = Formation(load_scenario("infinity", action="residual", residual_base=base, **fields))
+    one.reset(0)
+    other.reset(0)
+    for _ in range(one.scenario.horizon_steps):
+        one.arrays.actions[0] = policy.predict(one.arrays.observations[0])[0]
+        one.step()
+        other.step()
+        assert one.arrays.motions.tobytes() == other.arrays.motions.tobytes()
+        assert one.arrays.wanted.tobytes() == other.arrays.wanted.tobytes()
+
+
+def test_a_residual_stays_within_the_limits_of_its_base():
+    scenario = load_scenario("infinity", action="residual", residual_base="tuned", horizon_s=10.0)
+    formation = Formation(scenario)
+    formation.reset(0)
+    rng, a = np.random.default_rng(0), formation.arrays
+    robot, last = body(scenario.robot), np.zeros(3)
+    for _ in range(scenario.horizon_steps):
+        a.actions[0] = rng.uniform(-1, 1, a.actions[0].shape)
+        formation.step()
+        u_1, u_2 = odometry(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h)
+        assert (np.abs(u_1 - last) <= ALL.step_1 + 1e-3).all()
+        assert (np.abs(u_1 * u_2) <= ALL.lateral + 0.05).all()
+        last = u_1
+
+
+def test_on_board_and_from_outside_it_is_the_same_policy():
+    fields = {"estimator": "ekf-slip", "disturbance": "combined-medium", "horizon_s": 20.0}
+    fields |= {"end_on": (), "residual_base": "tuned"}
+    policy = ReferencePolicy("tuned", PERIOD_S, PREVIEW_S)
+    single = FormationEnv("infinity", learner="robot_1", others="reference", **fields)
+    env = tlf_env.parallel_env("infinity", **fields)
+    seen, _ = single.reset(seed=5)
+    observations, _ = env.reset(seed=5)
+    while env.agents:
+        seen, *_ = single.step(policy.predict(seen)[0])
+        actions = unstacked(env, policy.predict(stacked(observations))[0])
+        observations, *_ = env.step(actions)
+        there = single.formation_env.formation.arrays.observations[0]
+        assert there.tobytes() == stacked(observations).tobytes()
+        assert seen.tobytes() == observations["robot_1"].tobytes()
+
+
+# What the policy reads
+
+
+READ_WITH_LIMITS = ("command_u_1", "command_u_2", "slip_1", "slip_2")
+READ = ("e_1", "e_2", "sin_e_3", "cos_e_3", "reference_u_1", "reference_u_2", *READ_WITH_LIMITS)
+AHEAD_U = [len(Tracking._fields) + Preview._fields.index(name) for name in ("u_1", "u_2")]
+
+
+def leading(lead_s: float, name: str = "tuned") -> Controller:
+    return controller(name).model_copy(update={"lead_s": lead_s})
+
+
+def test_without_a_lead_no_preview_is_read():
+    rows, other = batch(), batch(seed=1)
+    needed = [place(name) for name in READ]
+    other[:, needed] = rows[:, needed]
+    policy = ReferencePolicy("tuned")
+    assert policy.predict(rows)[0].tobytes() == policy.predict(other)[0].tobytes()
+    short = np.ascontiguousarray(rows[:, : len(Tracking._fields)])
+    assert policy.predict(rows)[0].tobytes() == policy.predict(short)[0].tobytes()
+
+
+@pytest.mark.parametrize("name", READ)
+def test_everything_that_it_should_read_matters(name):
+    rows, other = 0.1 * batch(), 0.1 * batch()
+    other[:, place(name)] += np.float32(0.01)
+    policy = ReferencePolicy("tuned")
+    assert policy.predict(rows)[0].tobytes() != policy.predict(other)[0].tobytes()
+
+
+def test_with_a_lead_the_references_twist_is_that_of_later_by_a_straight_line():
+    rows = batch().astype(np.float64)
+    moved = rows.copy()
+    now = [place("reference_u_1"), place("reference_u_2")]
+    later = rows[:, AHEAD_U] * SCALES[AHEAD_U]
+    moved[:, now] = (0.9 * rows[:, now] * SCALES[now] + 0.1 * later) / SCALES[now]
+    for name in ("tuned", "consistent"):
+        found, _ = ReferencePolicy(leading(0.05, name)).predict(rows)
+        expected, _ = ReferencePolicy(leading(0.0, name)).predict(moved)
+        np.testing.assert_allclose(found, expected, rtol=1e-12, atol=1e-12)
+    assert (found != ReferencePolicy(leading(0.0, name)).predict(rows)[0]).any()
+
+
+@pytest.mark.parametrize("preview_s", [(), (0.0, 0.5)])
+def test_a_lead_needs_a_preview(preview_s):
+    with pytest.raises(ValueError, match=r"lead_s 0\.05 needs a first preview above 0"):
+        ReferencePolicy(leading(0.05), preview_s=preview_s)
+    with pytest.raises(ValueError, match="lead_s"):
+        controller_row(leading(0.05), PERIOD_S)
+    ReferencePolicy(leading(0.0), preview_s=preview_s)
+
+
+def test_a_lead_does_not_read_beyond_a_short_observation():
+    with pytest.raises(ValueError, match="shape"):
+        ReferencePolicy(leading(0.05)).predict(np.zeros(len(Tracking._fields), dtype=np.float32))
+
+
+def test_gains_alone_are_a_controller_without_limits():
+    assert ReferencePolicy(TrackingGains()).controller == controller("consistent")
+    assert controller("consistent") == Controller()
+
+
+def test_an_unknown_name_is_told_with_those_there_are():
+    with pytest.raises(ValueError, match=r"'bold' is not one of consistent, printed, tuned"):
+        controller("bold")
+    with pytest.raises(ValueError, match=r"'bold' is not one of consistent, printed, tuned"):
+        load_scenario("infinity", residual_base="bold")

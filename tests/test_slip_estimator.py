@@ -1,0 +1,403 @@
+"""The filter with two states for slip: against matrices, against its own model, and on the plant."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from helpers import untimed
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy import stats
+
+from baselines import ReferencePolicy
+from tlf_env.onboard.estimator import Ekf, Estimate, correct, predict
+from tlf_env.onboard.slip_estimator import (
+    SlipEkf,
+    SlipEkfParameters,
+    SlipEstimate,
+    correct_with_slip,
+    predict_with_slip,
+    slip_ekf_constants,
+)
+from tlf_env.onboard.tracking import body_errors
+from tlf_env.task.formation import Formation
+from tlf_env.task.scenario import load_scenario
+
+DT = 0.001
+PRESET = SlipEkfParameters()
+CHOSEN = slip_ekf_constants(PRESET, DT)
+FREE = CHOSEN._replace(bound_1=math.inf, bound_2=math.inf)
+CONFIDENCE = 0.999
+LAGS = 20
+
+small = st.floats(-0.5, 0.5)
+headings = st.floats(-10, 10)
+
+Both = tuple[Estimate, SlipEstimate]
+
+
+def packed(state, P: np.ndarray | None = None) -> Both:
+    """The law's two tuples of a state (x, y, θ, δ₁, δ₂) and a covariance (5, 5)."""
+    x, y, theta, delta_1, delta_2 = map(float, state)
+    P = np.zeros((5, 5)) if P is None else P
+    pose = P[:3, :3][np.triu_indices(3)].tolist()
+    slip = [*P[:3, 3], *P[:3, 4], P[3, 3], P[3, 4], P[4, 4]]
+    return Estimate(x, y, theta, *pose), SlipEstimate(delta_1, delta_2, *map(float, slip))
+
+
+def state_of(e: Estimate, z: SlipEstimate) -> np.ndarray:
+    return np.array([e.x, e.y, e.theta, z.delta_1, z.delta_2])
+
+
+def covariance(e: Estimate, z: SlipEstimate) -> np.ndarray:
+    return np.array(
+        [
+            [e.p_xx, e.p_xy, e.p_xt, z.p_x1, z.p_x2],
+            [e.p_xy, e.p_yy, e.p_yt, z.p_y1, z.p_y2],
+            [e.p_xt, e.p_yt, e.p_tt, z.p_t1, z.p_t2],
+            [z.p_x1, z.p_y1, z.p_t1, z.p_11, z.p_12],
+            [z.p_x2, z.p_y2, z.p_t2, z.p_12, z.p_22],
+        ]
+    )
+
+
+def random_covariance(rng: np.random.Generator) -> np.ndarray:
+    root = rng.normal(size=(5, 5)) * np.array([1.0, 1.0, 0.05, 5.0, 0.1])[:, None]
+    return root @ root.T
+
+
+def motion(state: np.ndarray, u_1: float, u_2: float, dt: float) -> np.ndarray:
+    """Where the state goes without noise: eq. (14) over one sample, by the midpoint rule."""
+    x, y, theta, delta_1, delta_2 = state
+    moved, turned = u_1 + delta_1 * dt, u_2 + delta_2 * dt
+    middle = theta + turned / 2
+    return np.array(
+        [x - moved * math.sin(middle), y + moved * math.cos(middle), theta + turned, *state[3:]]
+    )
+
+
+def jacobian(state: np.ndarray, u_1: float, u_2: float, dt: float) -> np.ndarray:
+    """∂motion/∂state by central differences."""
+    columns = []
+    for i, step in enumerate((1.0, 1.0, 1e-4, 1e-2, 1e-3)):
+        shift = np.zeros(5)
+        shift[i] = step
+        difference = motion(state + shift, u_1, u_2, dt) - motion(state - shift, u_1, u_2, dt)
+        columns.append(difference / (2 * step))
+    return np.stack(columns, axis=-1)
+
+
+class MatrixFilter:
+    """The filter as a textbook writes it; its Jacobian by hand."""
+
+    def __init__(self, state, P: np.ndarray, ekf: SlipEkf, dt: float) -> None:
+        self.x, self.P, self.ekf, self.dt = np.array(state, dtype=float), P, ekf, dt
+
+    def predict(self, u_1: float, u_2: float) -> None:
+        dt, ekf = self.dt, self.ekf
+        moved, turned = u_1 + self.x[3] * dt, u_2 + self.x[4] * dt
+        middle = self.x[2] + turned / 2
+        sin, cos = math.sin(middle), math.cos(middle)
+        F = np.eye(5)
+        F[0, 2:] = -moved * cos, -sin * dt, -moved * cos * dt / 2
+        F[1, 2:] = -moved * sin, cos * dt, -moved * sin * dt / 2
+        F[2, 4] = dt
+        axes = np.array([[-sin, cos], [cos, sin]])  # forward and sideways as columns
+        Q = np.diag([0.0, 0.0, ekf.heading, ekf.walk_1, ekf.walk_2])
+        Q[:2, :2] = axes @ np.diag([ekf.forward, ekf.sideways]) @ axes.T
+        self.x = motion(self.x, u_1, u_2, dt)
+        self.P = F @ self.P @ F.T + Q
+
+    def correct(self, fix) -> tuple[np.ndarray, float]:
+        H = np.eye(2, 5)
+        S = H @ self.P @ H.T + self.ekf.variance * np.eye(2)
+        gain = self.P @ H.T @ np.linalg.inv(S)
+        innovation = np.asarray(fix) - H @ self.x
+        self.x = self.x + gain @ innovation
+        self.P = (np.eye(5) - gain @ H) @ self.P
+        return innovation, float(innovation @ np.linalg.solve(S, innovation))
+
+
+# The law against matrices
+
+
+def test_single_steps_are_those_of_the_matrix_filter_to_rounding():
+    rng = np.random.default_rng(0)
+    for _ in range(300):
+        state = [*rng.uniform(-3000, 3000, 2), *rng.uniform(-4, 4, 1), *rng.normal(size=2)]
+        dt, P = rng.uniform(1e-3, 0.05), random_covariance(rng)
+        ekf = SlipEkf(*rng.uniform(0, 1, 5), rng.uniform(0.1, 5), math.inf, math.inf)
+        u_1, u_2 = rng.uniform(-10, 10), rng.uniform(-0.2, 0.2)
+        matrix = MatrixFilter(state, P, ekf, dt)
+        matrix.predict(u_1, u_2)
+        law = predict_with_slip(*packed(state, P), ekf, u_1, u_2, dt)
+        np.testing.assert_allclose(state_of(*law), matrix.x, rtol=1e-12, atol=1e-12)
+        np.testing.assert_allclose(covariance(*law), matrix.P, rtol=1e-11, atol=1e-12)
+        fix = matrix.x[:2] + rng.normal(0, 2, 2)
+        innovation, nis = matrix.correct(fix)
+        e, z, d_x, d_y, law_nis = correct_with_slip(*law, ekf, *map(float, fix))
+        np.testing.assert_allclose(state_of(e, z), matrix.x, rtol=1e-11, atol=1e-11)
+        np.testing.assert_allclose(covariance(e, z), matrix.P, rtol=1e-8, atol=1e-10)
+        np.testing.assert_allclose((d_x, d_y), innovation, rtol=1e-9, atol=1e-11)
+        assert law_nis == pytest.approx(nis, rel=1e-9)
+
+
+def test_filter_is_the_matrix_filter_over_a_run():
+    rng = np.random.default_rng(1)
+    state = [1000.0, -2000.0, 0.7, 0.0, 0.0]
+    law, matrix = packed(state), MatrixFilter(state, np.zeros((5, 5)), FREE, DT)
+    for _ in range(1000):
+        u_1, u_2 = rng.uniform(-0.6, 0.6), rng.uniform(-0.005, 0.005)
+        fix = matrix.x[:2] + rng.normal(0, 2, 2)
+        law = predict_with_slip(*law, FREE, u_1, u_2, DT)
+        matrix.predict(u_1, u_2)
+        *law, _, _, _ = correct_with_slip(*law, FREE, *map(float, fix))
+        matrix.correct(fix)
+        np.testing.assert_allclose(state_of(*law), matrix.x, rtol=1e-10, atol=1e-10)
+        np.testing.assert_allclose(covariance(*law), matrix.P, rtol=1e-7, atol=1e-11)
+
+
+@untimed
+@given(headings, st.floats(-20, 20), st.floats(-0.5, 0.5), st.floats(-60, 60), st.floats(-0.4, 0.4))
+def test_covariance_is_propagated_with_the_derivative_of_the_motion(
+    theta, u_1, u_2, delta_1, delta_2
+):
+    """Without noise P' = F P Fᵀ, F by differences of the motion."""
+    dt = 0.02
+    silent = SlipEkf(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, math.inf, math.inf)
+    state = np.array([0.0, 0.0, theta, delta_1, delta_2])
+    P = random_covariance(np.random.default_rng(2))
+    F = jacobian(state, u_1, u_2, dt)
+    law = predict_with_slip(*packed(state, P), silent, u_1, u_2, dt)
+    np.testing.assert_allclose(covariance(*law), F @ P @ F.T, rtol=1e-6, atol=1e-6)
+
+
+# Limits
+
+
+def test_without_doubt_about_slip_it_is_a_filter_of_the_pose():
+    """No walks and no doubt at the start: the slip stays 0, and the rest is the paper's filter."""
+    rng = np.random.default_rng(3)
+    u_1, u_2 = 0.4, 6e-4
+    paper = Ekf(2e-3, 1e-2, 0.0, 0.0, 0.2)  # noise of eq. (36) forward alone
+    forward = (paper.alpha_1 * u_1 + paper.alpha_2 * u_2) ** 2
+    ekf = SlipEkf(forward, 0.0, 0.0, 0.0, 0.0, 0.2, 60.0, 0.4)
+    P = np.zeros((5, 5))
+    P[:3, :3] = random_covariance(rng)[:3, :3]
+    law = packed([1.0, 2.0, 0.3, 0.0, 0.0], P)
+    pose = law[0]
+    for _ in range(1000):
+        fix = pose.x + rng.normal(), pose.y + rng.normal()
+        *law, _, _, nis = correct_with_slip(
+            *predict_with_slip(*law, ekf, u_1, u_2, DT), ekf, *map(float, fix)
+        )
+        pose, _, _, expected = correct(predict(pose, paper, u_1, u_2), paper, *map(float, fix))
+        np.testing.assert_allclose(law[0], pose, rtol=1e-9, atol=1e-12)
+        assert nis == pytest.approx(expected, rel=1e-9)
+    assert set(law[1]) == {0.0}
+
+
+def test_bounds_hold_the_slip_and_leave_the_rest_of_the_estimate():
+    rng = np.random.default_rng(4)
+    met = 0
+    for _ in range(200):
+        P = random_covariance(rng) * 100
+        start = packed([0.0, 0.0, 0.3, *rng.uniform(-1, 1, 2) * (60, 0.4)], P)
+        fix = tuple(map(float, rng.normal(0, 30, 2)))
+        free_e, free_z, *free = correct_with_slip(*start, FREE, *fix)
+        e, z, *rest = correct_with_slip(*start, CHOSEN, *fix)
+        assert abs(z.delta_1) <= PRESET.delta_1_bound_mm_s
+        assert abs(z.delta_2) <= PRESET.delta_2_bound_rad_s
+        assert (e, z[2:], rest) == (free_e, free_z[2:], free)
+        assert z.delta_1 == np.clip(free_z.delta_1, -60.0, 60.0)
+        assert z.delta_2 == np.clip(free_z.delta_2, -0.4, 0.4)
+        met += z[:2] != free_z[:2]
+    assert met > 50
+
+
+@untimed
+@given(st.lists(st.tuples(small, small, small, small), min_size=1, max_size=60), headings)
+def test_covariance_stays_positive_semidefinite(steps, theta):
+    law = packed([0.0, 0.0, theta, 0.0, 0.0])
+    for u_1, u_2, d_x, d_y in steps:
+        e, z = predict_with_slip(*law, CHOSEN, u_1, u_2, DT)
+        *law, _, _, nis = correct_with_slip(e, z, CHOSEN, e.x + d_x, e.y + d_y)
+        scale = np.sqrt(np.maximum(np.diag(covariance(*law)), 1e-30))
+        eigenvalues = np.linalg.eigvalsh(covariance(*law) / np.outer(scale, scale))
+        assert eigenvalues.min() > -1e-9
+        assert nis >= 0.0
+
+
+def test_a_fix_never_raises_the_variance():
+    rng = np.random.default_rng(5)
+    for _ in range(200):
+        P = random_covariance(rng)
+        e, z, *_ = correct_with_slip(*packed(np.zeros(5), P), FREE, 1.0, -1.0)
+        assert np.linalg.eigvalsh(P - covariance(e, z)).min() >= -1e-10
+
+
+# Variances per second
+
+
+@pytest.mark.parametrize("dt", [0.0005, 0.001, 0.005, 0.02])
+def test_doubt_grows_per_second_and_not_per_sample(dt):
+    """Standing for a second without a fix: random walks, and their integrals."""
+    ekf = slip_ekf_constants(PRESET, dt)
+    law = packed(np.zeros(5))
+    for _ in range(round(1 / dt)):
+        law = predict_with_slip(*law, ekf, 0.0, 0.0, dt)
+    P = covariance(*law)
+    assert P[3, 3] == pytest.approx(PRESET.delta_1_walk_mm2_s3, rel=1e-9)
+    assert P[4, 4] == pytest.approx(PRESET.delta_2_walk_rad2_s3, rel=1e-9)
+    assert P[0, 0] == pytest.approx(PRESET.sideways_noise_mm2_s, rel=1e-9)
+    forward = PRESET.forward_noise_mm2_s + PRESET.delta_1_walk_mm2_s3 / 3
+    assert P[1, 1] == pytest.approx(forward, rel=2 * dt)
+    heading = PRESET.heading_noise_rad2_s + PRESET.delta_2_walk_rad2_s3 / 3
+    assert P[2, 2] == pytest.approx(heading, rel=2 * dt)
+    assert P[1, 3] == pytest.approx(PRESET.delta_1_walk_mm2_s3 / 2, rel=2 * dt)
+
+
+@pytest.mark.parametrize("dt", [0.002, 0.005])
+def test_doubt_settles_at_the_same_level_if_fixes_tell_as_much_per_second(dt):
+    """Fewer fixes, each better by as much."""
+
+    def settled(period: float) -> np.ndarray:
+        known = PRESET.model_copy(
+            update={"fix_variance_mm2": PRESET.fix_variance_mm2 * DT / period}
+        )
+        ekf = slip_ekf_constants(known, period)
+        law = packed(np.zeros(5))
+        for _ in range(round(20 / period)):
+            e, z = predict_with_slip(*law, ekf, 300.0 * period, 0.3 * period, period)
+            *law, _, _, _ = correct_with_slip(e, z, ekf, e.x, e.y)
+        return np.diag(covariance(*law))
+
+    np.testing.assert_allclose(settled(dt), settled(DT), rtol=0.05)
+
+
+# Consistency where the filter's own model holds
+
+RUNS, SAMPLES, SAMPLE_S = 100, 400, 0.005
+
+
+class Simulated:
+    """Runs of robots that move as the filter believes, and what the filter made of them."""
+
+    def __init__(self) -> None:
+        rng, ekf = np.random.default_rng(6), slip_ekf_constants(PRESET, SAMPLE_S)
+        ekf = ekf._replace(bound_1=math.inf, bound_2=math.inf)
+        spreads = np.sqrt(ekf[:5])
+        self.innovations = np.empty((RUNS, SAMPLES, 2))  # forward and right, mm
+        self.nis = np.empty((RUNS, SAMPLES))
+        self.errors = np.empty((RUNS, 5))
+        self.covariances = np.empty((RUNS, 5, 5))
+        for run in range(RUNS):
+            truth = np.array([0.0, 0.0, rng.uniform(-4, 4), 0.0, 0.0])
+            law = packed(truth)
+            speed, yaw = rng.uniform(100, 500), rng.uniform(-1, 1)
+            for k in range(SAMPLES):
+                u_1, u_2 = speed * SAMPLE_S, yaw * SAMPLE_S
+                middle = truth[2] + (u_2 + truth[4] * SAMPLE_S) / 2
+                forward, sideways, *rest = spreads * rng.normal(size=5)
+                truth = motion(truth, u_1, u_2, SAMPLE_S)
+                sin, cos = math.sin(middle), math.cos(middle)
+                truth[:2] += -sin * forward + cos * sideways, cos * forward + sin * sideways
+                truth[2:] += rest
+                fix = truth[:2] + math.sqrt(ekf.variance) * rng.normal(size=2)
+                law = predict_with_slip(*law, ekf, u_1, u_2, SAMPLE_S)
+                heading = law[0].theta
+                *law, d_x, d_y, self.nis[run, k] = correct_with_slip(
+                    *law, ekf, float(fix[0]), float(fix[1])
+                )
+                self.innovations[run, k] = body_errors(d_x, d_y, heading)
+            self.errors[run] = state_of(*law) - truth
+            self.covariances[run] = covariance(*law)
+
+
+@pytest.fixture(scope="module")
+def simulated():
+    return Simulated()
+
+
+def test_nis_is_2_where_the_model_holds(simulated):
+    low, high = stats.chi2.interval(CONFIDENCE, 2 * simulated.nis.size)
+    assert low / simulated.nis.size < simulated.nis.mean() < high / simulated.nis.size
+
+
+def test_nees_is_5_where_the_model_holds(simulated):
+    nees = [
+        error @ np.linalg.solve(P, error)
+        for error, P in zip(simulated.errors, simulated.covariances, strict=True)
+    ]
+    low, high = stats.chi2.interval(CONFIDENCE, 5 * RUNS)
+    assert low / RUNS < np.mean(nees) < high / RUNS
+
+
+def test_estimates_are_unbiased_where_the_model_holds(simulated):
+    each = simulated.errors / np.sqrt(np.diagonal(simulated.covariances, axis1=1, axis2=2))
+    bound = stats.norm.ppf(1 - (1 - CONFIDENCE) / (2 * 5)) / math.sqrt(RUNS)
+    assert np.abs(each.mean(axis=0)).max() < bound
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+def test_innovations_are_white_where_the_model_holds(simulated, axis):
+    along = simulated.innovations[:, :, axis]
+    correlations = np.array(
+        [np.sum(along[:, k:] * along[:, :-k]) for k in range(1, LAGS + 1)]
+    ) / np.sum(along**2)
+    bound = stats.norm.ppf(1 - (1 - CONFIDENCE) / (2 * LAGS)) / math.sqrt(along.size)
+    assert np.abs(correlations).max() < bound
+
+
+# On the plant, in the loop. The filter expects noisier fixes than the nominal ones, and slip that wanders.
+
+
+class Loop:
+    """What the leader's filter estimated of a constant slip, and what it believed of its accuracy."""
+
+    def __init__(self, slip: tuple[float, float], physics_period_s: float) -> None:
+        scenario = load_scenario(
+            "infinity",
+            robots=1,
+            horizon_s=20.0,
+            estimator="ekf-slip",
+            physics_period_s=physics_period_s,
+            disturbance={
+                "slip": {"delta_1_mm_s": slip[0], "delta_2_rad_s": slip[1]},
+                "position": {"noise_std_mm": 0.2**0.5},
+            },
+            end_on=(),
+        )
+        formation, policy = Formation(scenario), ReferencePolicy("tuned")
+        formation.reset(0)
+        a = formation.arrays
+        slips, deviations = [], []
+        for _ in range(scenario.horizon_steps):
+            a.actions[0] = policy.predict(a.observations[0])[0]
+            formation.step()
+            z = SlipEstimate(*a.slip_estimates[:, 0, 0])
+            slips.append((z.delta_1, z.delta_2))
+            deviations.append((z.p_11**0.5, z.p_22**0.5))
+        self.slips, self.deviations = np.array(slips), np.array(deviations)
+        self.lost = a.lost.any()
+
+
+@pytest.mark.parametrize("slip", [(20.0, 0.2), (-30.0, -0.15), (0.0, 0.0)])
+def test_constant_slip_on_the_plant_is_found_within_the_stated_accuracy(slip):
+    """Within a tenth of it, from 8 s on: the fixes are better than the filter expects."""
+    loop = Loop(slip, 0.001)
+    assert not loop.lost
+    settled = slice(400, None)
+    errors, deviations = loop.slips[settled] - slip, loop.deviations[settled]
+    assert (np.abs(errors) < 0.5 * deviations).all()
+    assert (np.abs(errors.mean(axis=0)) < 0.1 * deviations.mean(axis=0)).all()
+
+
+def test_the_filter_believes_the_same_at_every_sampling_rate():
+    slow, fast = (Loop((10.0, 0.1), period) for period in (0.002, 0.001))
+    np.testing.assert_allclose(slow.deviations[-1], fast.deviations[-1], rtol=0.05)
+    np.testing.assert_allclose(
+        slow.slips[400:].mean(axis=0), fast.slips[400:].mean(axis=0), atol=0.1
+    )
