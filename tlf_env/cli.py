@@ -76,7 +76,9 @@ def run(
     observer: Annotated[str | None, typer.Option(help="module:factory of an observer.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     robots: Annotated[int | None, typer.Option(help="How many robots.")] = None,
-    plant: Annotated[str | None, typer.Option(help="pymunk or kinematic.")] = None,
+    plant: Annotated[
+        str | None, typer.Option(help="pymunk, batch (no contact) or kinematic.")
+    ] = None,
     control_period_s: Annotated[float | None, typer.Option(help="Period of the policy, s.")] = None,
     horizon_s: Annotated[float | None, typer.Option(help="Length of the run, s.")] = None,
     out: Annotated[
@@ -259,6 +261,10 @@ def bench(
         ),
     ] = None,
     horizon_s: Annotated[float | None, typer.Option(help="Length of each run, s.")] = None,
+    plant: Annotated[
+        str | None,
+        typer.Option(help="pymunk, batch (seeds side by side, no contact) or kinematic."),
+    ] = None,
     processes: Annotated[int, typer.Option(help="Processes on this machine; 0: one per core.")] = 0,
     ray: Annotated[
         str | None, typer.Option(help="Address of an existing Ray cluster to run on instead.")
@@ -286,7 +292,11 @@ def bench(
         level=level,
         sweep=path,
         sweep_values=values,
-        overrides=() if horizon_s is None else (("horizon_s", horizon_s),),
+        overrides=tuple(
+            (field, value)
+            for field, value in (("horizon_s", horizon_s), ("plant", plant))
+            if value is not None
+        ),
         trust=trust,
     )
     with progress_bar("bench") as update:

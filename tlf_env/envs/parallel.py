@@ -22,6 +22,7 @@ from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.arrays import END_REASONS, Info, State
 from tlf_env.task.channels import PATHS
 from tlf_env.task.formation import STATE_SCALES, Formation
+from tlf_env.task.judging import terminated, truncated
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
@@ -197,13 +198,13 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self._formation.step()
         a = self._formation.arrays
         rewards = dict(zip(self.agents, a.rewards[0].tolist(), strict=True))
-        terminated, truncated, ends = self._ends()
+        ended, cut, ends = self._ends()
         observations, infos = self._observations(), self._infos()
         if ends:
             for agent, reason in ends.items():
                 infos[agent]["end"] = reason
             self.agents = []
-        return observations, rewards, terminated, truncated, infos
+        return observations, rewards, ended, cut, infos
 
     def _take(self, actions: dict[Agent, np.ndarray]) -> None:
         buffer = self._formation.arrays.actions[0]
@@ -234,11 +235,13 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         raise ValueError(f"{what}; the agents are {', '.join(self.agents)}")
 
     def _ends(self) -> tuple[dict[Agent, bool], dict[Agent, bool], dict[Agent, str]]:
-        a = self._formation.arrays
-        terminated = dict(zip(self.agents, a.terminated[0].tolist(), strict=True))
-        truncated = dict(zip(self.agents, a.truncated[0].tolist(), strict=True))
-        reasons = zip(self.agents, a.ends[0].tolist(), strict=True)
-        return terminated, truncated, {agent: END_REASONS[end] for agent, end in reasons if end}
+        ends = self._formation.arrays.ends[0]
+        reasons = zip(self.agents, ends.tolist(), strict=True)
+        return (
+            dict(zip(self.agents, terminated(ends).tolist(), strict=True)),
+            dict(zip(self.agents, truncated(ends).tolist(), strict=True)),
+            {agent: END_REASONS[end] for agent, end in reasons if end},
+        )
 
     def _seen(self) -> np.ndarray:
         a = self._formation.arrays

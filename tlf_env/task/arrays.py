@@ -138,22 +138,25 @@ class State(NamedTuple):
     reference_y_mm: float
 
 
+class Variants(NamedTuple):
+    """Constants of the scenarios that lanes may run, as an episode's start needs them."""
+
+    bodies: np.ndarray  # (field, robot, variant), without payload
+    wheel_loops: np.ndarray  # (field, robot, variant)
+    ekfs: np.ndarray  # (field, robot, variant)
+    levels: np.ndarray  # (variant,) of the disturbance
+    mixture: np.ndarray  # (variant,): summed shares if every episode draws its variant, else empty
+
+
 class Arrays(NamedTuple):
     """``(field, robot, lane)`` unless said; a lane is one formation.
 
-    Lanes may run different scenarios, their *variants*.
+    Lanes may run different scenarios, their :class:`Variants`.
     """
 
     # constants of the variants
-    empty_bodies: np.ndarray  # (field, robot, variant): without payload
-    variant_loops: np.ndarray  # (field, robot, variant)
-    variant_ekfs: np.ndarray  # (field, robot, variant)
-    variant_levels: np.ndarray  # (variant,)
     signals: np.ndarray  # (variant, channel, SignalRow)
     patches: np.ndarray  # (variant, patch, PatchRow)
-    mixture: (
-        np.ndarray
-    )  # (variant,): summed shares of the variants if episodes draw theirs, else empty
     table: np.ndarray  # (step, Reference): the leader's reference at the control steps
     # constants of an episode
     variants: np.ndarray  # (lane,) int64
@@ -205,8 +208,6 @@ class Arrays(NamedTuple):
     lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
     touched_now: np.ndarray
     ends: np.ndarray  # (lane, robot) int8: why the episode ended in this step, as in END_REASONS
-    terminated: np.ndarray  # (lane, robot) bool, in this step
-    truncated: np.ndarray
     scales: np.ndarray  # (entry,) of `tracking`
     sensor_scales: np.ndarray  # (entry,) of `sensor`
     weights: np.ndarray  # (RewardTerms,)
@@ -258,16 +259,26 @@ def _loop_row(scenario: Scenario) -> tuple[float, ...]:
     return digital_wheel_loop(wheel_loop, scenario.physics_period_s)
 
 
+def make_variants(scenarios: Sequence[Scenario], mixture: Sequence[float] = ()) -> Variants:
+    """Constants of the scenarios; with the shares ``mixture``, which sum to 1, episodes draw theirs."""
+    n = scenarios[0].robot_count
+    return Variants(
+        bodies=np.concatenate([body_array(list(one.robot_models)) for one in scenarios], axis=2),
+        wheel_loops=_per_variant([_loop_row(one) for one in scenarios], n),
+        ekfs=_per_variant([ekf_constants(one.ekf) for one in scenarios], n),
+        levels=np.array([one.disturbance.level for one in scenarios]),
+        mixture=np.cumsum(np.array(mixture, dtype=np.float64)),
+    )
+
+
 def make_arrays(
     scenarios: Sequence[Scenario],
     table: np.ndarray,
     lanes: int = 1,
-    mixture: Sequence[float] = (),
 ) -> Arrays:
-    """Arrays of ``lanes`` formations, not yet reset; lane k runs variant k modulo their number.
+    """Arrays of ``lanes`` formations, not yet reset; lane k runs scenario k modulo their number.
 
     The scenarios may differ in their robots' parameters, wheel loops, filters and disturbances only.
-    With the shares ``mixture`` of the variants, which sum to 1, every episode draws its own.
     """
     scenario = scenarios[0]
     n = scenario.robot_count
@@ -286,12 +297,6 @@ def make_arrays(
         return np.zeros((fields, n, lanes))
 
     return Arrays(
-        empty_bodies=np.concatenate(
-            [body_array(list(one.robot_models)) for one in scenarios], axis=2
-        ),
-        variant_loops=_per_variant([_loop_row(one) for one in scenarios], n),
-        variant_ekfs=_per_variant([ekf_constants(one.ekf) for one in scenarios], n),
-        variant_levels=np.array([one.disturbance.level for one in scenarios]),
         signals=np.array(
             [
                 signal_rows(one.disturbance, one.physics_period_s, one.control_period_s)
@@ -299,7 +304,6 @@ def make_arrays(
             ]
         ),
         patches=_all_patches(scenarios),
-        mixture=np.cumsum(np.array(mixture, dtype=np.float64)),
         table=table.copy(),
         variants=np.arange(lanes) % len(scenarios),
         bodies=zeros(len(Body._fields)),
@@ -342,8 +346,6 @@ def make_arrays(
         lost_now=np.zeros((lanes, n), dtype=np.bool_),
         touched_now=np.zeros((lanes, n), dtype=np.bool_),
         ends=np.zeros((lanes, n), dtype=np.int8),
-        terminated=np.zeros((lanes, n), dtype=np.bool_),
-        truncated=np.zeros((lanes, n), dtype=np.bool_),
         scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
         sensor_scales=np.array(
             [entry.scale for entry in sensor_entries(scenario.substeps).values()]

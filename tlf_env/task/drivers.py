@@ -32,6 +32,7 @@ from tlf_env.task.actions import (
 from tlf_env.task.arrays import (
     RUNNING,
     Arrays,
+    Variants,
     read_effects,
     read_sensors,
     read_trace,
@@ -155,26 +156,28 @@ def conclude_lane(a: Arrays, lane: int, s: Settings) -> None:
 
 
 @driver
-def message_slot_of(a: Arrays, r: int, step: int, s: Settings) -> int:
-    """:func:`message_slot` of lane 0, for observers outside."""
-    return message_slot(a, 0, r, step, s)
+def message_slot_of(a: Arrays, lane: int, r: int, step: int, s: Settings) -> int:
+    """:func:`message_slot`, for observers outside."""
+    return message_slot(a, lane, r, step, s)
 
 
 @driver
-def delays_of(a: Arrays, r: int, dt: float) -> tuple[int, int]:
-    """:func:`delays` of lane 0, for wheel loops outside."""
-    return delays(a, 0, r, dt)
+def delays_of(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
+    """:func:`delays`, for wheel loops outside."""
+    return delays(a, lane, r, dt)
 
 
 @driver
-def start(a: Arrays, mask: np.ndarray, poses: np.ndarray, s: Settings) -> tuple[int, int, int]:
+def start(
+    a: Arrays, of: Variants, mask: np.ndarray, poses: np.ndarray, s: Settings
+) -> tuple[int, int, int]:
     """:func:`start_lane` of every lane of the mask, up to the first that fails.
 
     Returns its result and the lane. :func:`look` comes after it.
     """
     for lane in range(mask.shape[0]):
         if mask[lane]:
-            result, robot = start_lane(a, lane, s, poses)
+            result, robot = start_lane(a, of, lane, poses, s)
             if result != STARTED:
                 return result, robot, lane
     return STARTED, 0, 0
@@ -190,21 +193,19 @@ def look(a: Arrays, mask: np.ndarray, at_start: bool, s: Settings) -> None:
                 for r in range(a.ends.shape[1]):
                     a.lost[lane, r] = a.lost_now[lane, r] = False
                     a.ends[lane, r] = RUNNING
-                    a.terminated[lane, r] = a.truncated[lane, r] = False
 
 
 @driver
-def transmit(a: Arrays, s: Settings) -> None:
-    """:func:`transmit_lane` of lane 0, and the leader's next reference."""
-    transmit_lane(a, 0, s)
-    next_reference(a, 0, 0, a.clock[0, 1] + s.lookahead, s)
+def transmit(a: Arrays, lane: int, s: Settings) -> None:
+    """:func:`transmit_lane`."""
+    transmit_lane(a, lane, s)
 
 
 @driver
-def observe_followers(a: Arrays, s: Settings) -> None:
-    """The followers' next references in lane 0."""
-    for r in range(1, a.motions.shape[1]):
-        next_reference(a, 0, r, a.clock[0, 1] + s.lookahead, s)
+def refer(a: Arrays, lane: int, first: int, last: int, s: Settings) -> None:
+    """The next references of the robots from ``first`` to before ``last``."""
+    for r in range(first, last):
+        next_reference(a, lane, r, a.clock[lane, 1] + s.lookahead, s)
 
 
 @block
@@ -214,70 +215,70 @@ def are_near(a: Arrays, lane: int, s: Settings) -> bool:
 
 
 @driver
-def actuate(a: Arrays, k: int, s: Settings) -> None:
-    """The first half of substep ``k`` of lane 0: everything up to the plant's new velocities and poses."""
-    tick = a.clock[0, 0]
+def actuate(a: Arrays, lane: int, k: int, s: Settings) -> None:
+    """The first half of substep ``k`` of a lane: everything up to the plant's new velocities and poses."""
+    tick = a.clock[lane, 0]
     for r in range(a.motions.shape[1]):
-        kind = a.kinds[r, 0]
+        kind = a.kinds[r, lane]
         if s.external_wheel_loop and kind != TORQUE:
             kind = EXTERNAL_TORQUE
         if s.changing:
-            evaluate(a, 0, r, 0, SUBSTEP_CHANNELS, tick, s)
-        dead, hold = delays(a, 0, r, s.dt)
-        wanted_l, wanted_r = a.commands[0, r, 0], a.commands[1, r, 0]
+            evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, tick, s)
+        dead, hold = delays(a, lane, r, s.dt)
+        wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
         if k < hold and kind != EXTERNAL_TORQUE:
-            wanted_l, wanted_r = a.wanted_before[0, r, 0], a.wanted_before[1, r, 0]
+            wanted_l, wanted_r = a.wanted_before[0, r, lane], a.wanted_before[1, r, lane]
         motion, contact, held, trace = actuate_robot(
-            read_body(a.bodies, r, 0),
-            read_wheel_loop(a.wheel_loops, r, 0),
-            read_effects(a.applied, r, 0),
-            read_motion(a.motions, r, 0),
-            read_contact(a.contacts, r, 0),
-            read_loop_state(a.loop_states, r, 0),
-            read_sensors(a.sensors, r, 0),
-            read_trace(a.traces, r, 0),
+            read_body(a.bodies, r, lane),
+            read_wheel_loop(a.wheel_loops, r, lane),
+            read_effects(a.applied, r, lane),
+            read_motion(a.motions, r, lane),
+            read_contact(a.contacts, r, lane),
+            read_loop_state(a.loop_states, r, lane),
+            read_sensors(a.sensors, r, lane),
+            read_trace(a.traces, r, lane),
             kind,
             wanted_l,
             wanted_r,
-            a.patches[a.variants[0]],
-            a.torques[:, :, r, 0],
+            a.patches[a.variants[lane]],
+            a.torques[:, :, r, lane],
             dead,
             tick + 1,
             s.kinematic,
             s.dt,
         )
-        write_motion(a.motions, r, 0, motion)
-        write_contact(a.contacts, r, 0, contact)
-        write_loop_state(a.loop_states, r, 0, held)
-        write_trace(a.traces, r, 0, trace)
+        write_motion(a.motions, r, lane, motion)
+        write_contact(a.contacts, r, lane, contact)
+        write_loop_state(a.loop_states, r, lane, held)
+        write_trace(a.traces, r, lane, trace)
 
 
 @driver
-def sense(a: Arrays, k: int, s: Settings) -> None:
-    """The second half of substep ``k`` of lane 0: sensors and estimator, and which outlines meet."""
-    tick = a.clock[0, 0] + 1
+def sense(a: Arrays, lane: int, k: int, s: Settings) -> None:
+    """The second half of substep ``k`` of a lane: sensors and estimator, and which outlines meet."""
+    tick = a.clock[lane, 0] + 1
     for r in range(a.motions.shape[1]):
         sensors, estimate, trace, sample = sense_robot(
-            read_body(a.bodies, r, 0),
-            read_ekf(a.ekfs, r, 0),
-            read_effects(a.applied, r, 0),
-            read_motion(a.motions, r, 0),
-            read_sensors(a.sensors, r, 0),
-            read_estimate(a.estimates, r, 0),
-            read_trace(a.traces, r, 0),
-            a.seeds[0],
-            a.clock[0, 2],
+            read_body(a.bodies, r, lane),
+            read_ekf(a.ekfs, r, lane),
+            read_effects(a.applied, r, lane),
+            read_motion(a.motions, r, lane),
+            read_sensors(a.sensors, r, lane),
+            read_estimate(a.estimates, r, lane),
+            read_trace(a.traces, r, lane),
+            a.seeds[lane],
+            a.clock[lane, 2],
             r,
             tick,
             s.estimator,
             s.dt,
         )
-        write_sample(a.samples[k], r, 0, sample)
-        write_sensors(a.sensors, r, 0, sensors)
-        write_estimate(a.estimates, r, 0, estimate)
-        write_trace(a.traces, r, 0, trace)
-    a.clock[0, 0] = tick
-    mark_touched(a, 0)
+        write_sample(a.samples[k], r, lane, sample)
+        write_sensors(a.sensors, r, lane, sensors)
+        write_estimate(a.estimates, r, lane, estimate)
+        write_trace(a.traces, r, lane, trace)
+    a.clock[lane, 0] = tick
+    mark_touched(a, lane)
 
 
 @driver

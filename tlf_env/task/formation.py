@@ -12,7 +12,7 @@ from tlf_env.physics.parameters import Body
 from tlf_env.physics.pymunk_plant import PymunkPlant
 from tlf_env.physics.state import Motion
 from tlf_env.task import drivers
-from tlf_env.task.arrays import Arrays, make_arrays
+from tlf_env.task.arrays import Arrays, Variants, make_arrays, make_variants
 from tlf_env.task.channels import (
     CHANNELS,
     PATHS,
@@ -57,6 +57,7 @@ class Formation:
         self.scenario = scenario
         self._table = reference_table(scenario)
         self.arrays: Arrays = make_arrays([scenario], self._table)
+        self._variants = make_variants([scenario])
         self.plant = PymunkPlant(list(scenario.robot_models))
         self._parts = Parts(part_factories(scenario, parts or {}), scenario)
         self._settings = settings(scenario)
@@ -91,9 +92,11 @@ class Formation:
         a, s = self.arrays, self._settings
         a.clock[0], a.seeds[0] = (0, 0, episode), seed
         a.table[:] = reference_table(self.scenario, phase_s) if phase_s else self._table
-        result, r, _ = drivers.start(a, ALONE, NO_POSES if poses is None else poses, s)
+        result, r, _ = drivers.start(
+            a, self._variants, ALONE, NO_POSES if poses is None else poses, s
+        )
         if result != STARTED:
-            raise ValueError(refusal(a, result, r))
+            raise ValueError(refusal(a, self._variants, result, r))
         self.plant.reset(a.bodies[:, :, 0])
         self._parts.reset(a, s)
         drivers.look(a, ALONE, True, s)
@@ -154,11 +157,10 @@ class Formation:
                 f"robot_{result}: the action must be finite, got {a.actions[0, result].tolist()}"
             )
         self._substep_by_substep(close=result == drivers.MUST_COLLIDE)
-        drivers.transmit(a, s)
+        drivers.transmit(a, 0, s)
+        drivers.refer(a, 0, 0, 1 if s.external_observer else self.scenario.robot_count, s)
         if s.external_observer:
             self._parts.observe(a, s)
-        else:
-            drivers.observe_followers(a, s)
         drivers.look(a, ALONE, False, s)
 
     def _substep_by_substep(self, close: bool) -> None:
@@ -166,10 +168,10 @@ class Formation:
         for k in range(s.substeps):
             self._parts.drive(a, k, s)
             before = a.motions.copy() if close else a.motions
-            drivers.actuate(a, k, s)
+            drivers.actuate(a, 0, k, s)
             if close:
                 self.plant.collide(before, a.motions, s.dt)
-            drivers.sense(a, k, s)
+            drivers.sense(a, 0, k, s)
             self._parts.estimate(a, k)
 
     def state(self) -> np.ndarray:
@@ -177,11 +179,11 @@ class Formation:
         return state_rows(self.arrays)[0]
 
 
-def refusal(a: Arrays, result: int, r: int, lane: int = 0) -> str:
+def refusal(a: Arrays, of: Variants, result: int, r: int, lane: int = 0) -> str:
     """Why a lane could not start, in one line."""
     if result == OFF_BASE:
         mass, behind = a.applied[PAYLOAD_MASS, r, lane], a.applied[PAYLOAD_BEHIND, r, lane]
-        laden, empty = Body(*a.bodies[:, r, lane]), Body(*a.empty_bodies[:, r, a.variants[lane]])
+        laden, empty = Body(*a.bodies[:, r, lane]), Body(*of.bodies[:, r, a.variants[lane]])
         return (
             f"payload of {mass:g} kg at {behind:g} mm puts the centre of mass {laden.d:g} mm behind "
             f"the axle; the wheels carry it from 0 to {empty.pivot + empty.T:g} mm"

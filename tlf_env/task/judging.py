@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import block, law
 from tlf_env.onboard.estimator import read_estimate
@@ -189,7 +191,7 @@ def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
 def end_lane(a: Arrays, lane: int, s: Settings) -> None:
     """Whether and why the episode ended in this step: for the whole formation at once.
 
-    The robots concerned are terminated, the others truncated; the horizon truncates all.
+    See :func:`terminated` and :func:`truncated`.
     """
     rest = HORIZON if a.clock[lane, 1] >= s.horizon else RUNNING
     for r in range(a.ends.shape[1]):
@@ -201,7 +203,15 @@ def end_lane(a: Arrays, lane: int, s: Settings) -> None:
         if a.ends[lane, r] != RUNNING:
             rest = OTHER_ROBOT
     for r in range(a.ends.shape[1]):
-        a.terminated[lane, r] = a.ends[lane, r] != RUNNING
-        a.truncated[lane, r] = rest != RUNNING and not a.terminated[lane, r]
-        if a.truncated[lane, r]:
+        if a.ends[lane, r] == RUNNING:
             a.ends[lane, r] = rest
+
+
+def terminated(ends: np.ndarray) -> np.ndarray:
+    """Who ended the episode, of any shape: who was lost or touched another."""
+    return (ends == LOST) | (ends == TOUCHED)
+
+
+def truncated(ends: np.ndarray) -> np.ndarray:
+    """Whose episode was ended by another robot or the horizon, of any shape."""
+    return (ends == OTHER_ROBOT) | (ends == HORIZON)

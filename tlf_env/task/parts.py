@@ -69,7 +69,7 @@ class Parts:
         for r, loop in enumerate(self._of("wheel_loop")):
             if a.kinds[r, 0] == TORQUE:
                 continue
-            _, hold = drivers.delays_of(a, r, s.dt)
+            _, hold = drivers.delays_of(a, 0, r, s.dt)
             wanted = (a.wanted_before if k < hold else a.wanted)[:, r, 0].copy()
             measured = a.sensors[SPEEDS, r, 0]
             torques = finite(
@@ -90,7 +90,7 @@ class Parts:
             self._observe_one(a, s, r, int(a.clock[0, 1]) + s.lookahead)
 
     def _observe_one(self, a: Arrays, s: Settings, r: int, m: int) -> None:
-        old = drivers.message_slot_of(a, r, m, s)
+        old = drivers.message_slot_of(a, 0, r, m, s)
         message = Message(*a.messages[:, old, r - 1, 0].tolist())
         reference = self._made["observer"][r].update(message, m * s.period)
         row = finite(reference, 5, f"robot_{r}: the observer's update()")

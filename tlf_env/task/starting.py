@@ -10,7 +10,7 @@ from tlf_env.numerics.compiled import block, law, writer
 from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.physics.parameters import Mass, laden
 from tlf_env.physics.state import read_body
-from tlf_env.task.arrays import Arrays
+from tlf_env.task.arrays import Arrays, Variants
 from tlf_env.task.channels import (
     MIXTURE,
     PAYLOAD_BEHIND,
@@ -74,19 +74,19 @@ def clear_lane(a: Arrays, lane: int) -> None:
 
 
 @block
-def take_variant(a: Arrays, lane: int) -> None:
+def take_variant(a: Arrays, of: Variants, lane: int) -> None:
     """The lane's scenario in this episode, drawn if there is a mixture, and its constants."""
-    if a.mixture.shape[0] > 0:
+    if of.mixture.shape[0] > 0:
         word, _, _, _ = words(a.seeds[lane], MIXTURE, 0, a.clock[lane, 2], 0)
         v = 0
-        while v < a.mixture.shape[0] - 1 and unit(word) >= a.mixture[v]:
+        while v < of.mixture.shape[0] - 1 and unit(word) >= of.mixture[v]:
             v += 1
         a.variants[lane] = v
     v = a.variants[lane]
-    copy(a.bodies, lane, a.empty_bodies, v)
-    copy(a.wheel_loops, lane, a.variant_loops, v)
-    copy(a.ekfs, lane, a.variant_ekfs, v)
-    a.levels[lane] = a.variant_levels[v]
+    copy(a.bodies, lane, of.bodies, v)
+    copy(a.wheel_loops, lane, of.wheel_loops, v)
+    copy(a.ekfs, lane, of.ekfs, v)
+    a.levels[lane] = of.levels[v]
 
 
 @block
@@ -191,13 +191,15 @@ def begin(a: Arrays, lane: int, s: Settings) -> None:
 
 
 @block
-def start_lane(a: Arrays, lane: int, s: Settings, poses: np.ndarray) -> tuple[int, int]:
+def start_lane(
+    a: Arrays, of: Variants, lane: int, poses: np.ndarray, s: Settings
+) -> tuple[int, int]:
     """Start the episode of a lane's seed and number; ``poses`` (robot, 3) if given, else without rows.
 
     Returns ``STARTED``, or ``OFF_BASE`` or ``NO_ROOM`` and the robot.
     """
     clear_lane(a, lane)
-    take_variant(a, lane)
+    take_variant(a, of, lane)
     robots = a.motions.shape[1]
     for r in range(robots):
         evaluate(a, lane, r, 0, a.signals.shape[1], 0, s)
