@@ -14,7 +14,7 @@ import json
 import os
 import subprocess
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
@@ -24,15 +24,16 @@ from typing import Any, NamedTuple
 
 from baselines.learned import LearnedPolicy
 from baselines.policies import enter
-from baselines.run import Policy, run_policy, versions
-from tlf_env.envs.parallel import checked_seed
+from baselines.run import Policy, Record, run_policy, run_seeds, versions
 from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.files import atomic
+from tlf_env.numerics.philox import checked_seed
 from tlf_env.task.scenario import Scenario, load_scenario, preset_names, presets_folder
 
 RUNS, PLAN = "runs.jsonl", "plan.json"
 FIRST_TABLE_SEED = 20_000
 IN_FLIGHT_PER_PROCESS = 4
+SEEDS_PER_BLOCK = 25  # a record takes 2 to 4 MB
 
 
 class Cell(NamedTuple):
@@ -161,15 +162,50 @@ def run_cell(plan: Plan, cell: Cell) -> dict[str, Any]:
     The scenario is the plan's with what the policy asks for: what it sees, acts on and runs on board.
     """
     policy, scenario, overrides = enter(cell.policy, plan.scenario(cell), trust=plan.trust)
-    record = run_policy(scenario, policy, cell.seed, name=cell.policy)
+    return _line(cell, policy, overrides, run_policy(scenario, policy, cell.seed, name=cell.policy))
+
+
+def run_block(plan: Plan, cells: Sequence[Cell]) -> list[dict[str, Any]]:
+    """Run the episodes of a block, side by side if their plant is ``batch``; their lines."""
+    first = cells[0]
+    policy, scenario, overrides = enter(first.policy, plan.scenario(first), trust=plan.trust)
+    if scenario.plant != "batch":
+        return [run_cell(plan, cell) for cell in cells]
+    records = run_seeds(scenario, policy, [cell.seed for cell in cells], name=first.policy)
+    return [
+        _line(cell, policy, overrides, record) for cell, record in zip(cells, records, strict=True)
+    ]
+
+
+def _line(cell: Cell, policy: Policy, overrides: dict[str, Any], record: Record) -> dict[str, Any]:
     return {
         **cell._asdict(),
-        "scenario_hash": scenario_hash(scenario),
+        "scenario_hash": scenario_hash(record.scenario),
         "overrides": overrides,
-        "privileged": scenario.privileged or bool(getattr(policy, "privileged", False)),
+        "privileged": record.scenario.privileged or bool(getattr(policy, "privileged", False)),
+        "contact": record.contact,
         "string": record.string()._asdict(),
         "robots": [metrics._asdict() for metrics in record.metrics()],
     }
+
+
+def blocks(plan: Plan, cells: Sequence[Cell]) -> list[tuple[Cell, ...]]:
+    """Cells that are run and written together: one by one, or on the batch plant up to 25 seeds.
+
+    A block's cells differ in their seeds only. Blocks come in the order of their first cells.
+    """
+    if dict(plan.overrides).get("plant") != "batch":
+        return [(cell,) for cell in cells]
+    alike: dict[Cell, list[Cell]] = {}
+    for cell in cells:
+        alike.setdefault(cell._replace(seed=0), []).append(cell)
+    parts = [
+        tuple(group[i : i + SEEDS_PER_BLOCK])
+        for group in alike.values()
+        for i in range(0, len(group), SEEDS_PER_BLOCK)
+    ]
+    place = {cell: i for i, cell in enumerate(cells)}
+    return sorted(parts, key=lambda part: place[part[0]])
 
 
 def scenario_hash(scenario: Scenario) -> str:
@@ -340,34 +376,37 @@ def run_bench(
     total = len(plan.cells())
     if progress is not None:
         progress(total - len(todo), total)
-    finished: Iterable[dict[str, Any]]
+    finished: Iterable[list[dict[str, Any]]]
     if ray_address is not None:
-        finished = _on_ray(plan, todo, ray_address)
+        finished = _on_ray(plan, blocks(plan, todo), ray_address)
     elif processes == 1:
-        finished = (run_cell(plan, cell) for cell in todo)
+        finished = (run_block(plan, block) for block in blocks(plan, todo))
     else:
-        finished = _in_processes(plan, todo, processes)
-    for line in finished:
-        results.add(line)
+        finished = _in_processes(plan, blocks(plan, todo), processes)
+    for lines in finished:
+        for line in lines:
+            results.add(line)
         if progress is not None:
             progress(len(results.lines), total)
     return results
 
 
-def _in_processes(plan: Plan, cells: list[Cell], processes: int) -> Iterator[dict[str, Any]]:
-    """Results as they come; only a few episodes are handed out ahead, so that an interrupt is quick."""
-    waiting = iter(cells)
+def _in_processes(
+    plan: Plan, work: list[tuple[Cell, ...]], processes: int
+) -> Iterator[list[dict[str, Any]]]:
+    """Results as they come; only a few blocks are handed out ahead, so that an interrupt is quick."""
+    waiting = iter(work)
     pool = ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_end_with_parent
     )
-    running: set[Future[dict[str, Any]]] = set()
+    running: set[Future[list[dict[str, Any]]]] = set()
     try:
         while True:
             while len(running) < processes * IN_FLIGHT_PER_PROCESS:
-                cell = next(waiting, None)
-                if cell is None:
+                block = next(waiting, None)
+                if block is None:
                     break
-                running.add(pool.submit(run_cell, plan, cell))
+                running.add(pool.submit(run_block, plan, block))
             if not running:
                 return
             done, running = wait(running, return_when=FIRST_COMPLETED)
@@ -389,7 +428,9 @@ def _end_with_parent() -> None:
     threading.Thread(target=wait_and_leave, daemon=True).start()
 
 
-def _on_ray(plan: Plan, cells: list[Cell], address: str) -> Iterator[dict[str, Any]]:
+def _on_ray(
+    plan: Plan, work: list[tuple[Cell, ...]], address: str
+) -> Iterator[list[dict[str, Any]]]:
     """Results as they come from an existing Ray cluster.
 
     Raises
@@ -406,17 +447,17 @@ def _on_ray(plan: Plan, cells: list[Cell], address: str) -> Iterator[dict[str, A
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise ValueError(f"no Ray cluster at {address!r}: {error}") from error
     try:
-        remote = ray.remote(num_cpus=1)(run_cell)
+        remote = ray.remote(num_cpus=1)(run_block)
         shared = ray.put(plan)
         limit = IN_FLIGHT_PER_PROCESS * max(1, int(ray.cluster_resources().get("CPU", 1)))
-        waiting = iter(cells)
+        waiting = iter(work)
         running: list[Any] = []
         while True:
             while len(running) < limit:
-                cell = next(waiting, None)
-                if cell is None:
+                block = next(waiting, None)
+                if block is None:
                     break
-                running.append(remote.remote(shared, cell))
+                running.append(remote.remote(shared, block))
             if not running:
                 return
             done, running = ray.wait(running)

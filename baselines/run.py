@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import platform
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -12,11 +12,12 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tlf_env.envs.parallel import checked_seed
 from tlf_env.numerics.files import atomic
+from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import Factory
 from tlf_env.physics.state import Motion
 from tlf_env.task.arrays import Arrays, Info
+from tlf_env.task.batch import BatchPlant
 from tlf_env.task.formation import Formation
 from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, string_metrics
 from tlf_env.task.scenario import Scenario
@@ -93,6 +94,7 @@ FROM_WHEELS = (
     "omega_l_command_rad_s",
     "omega_r_command_rad_s",
 )
+INFO_PLACES = [Info._fields.index(name) for name in FROM_INFO]
 PSI, THETA, OMEGA_L, OMEGA_R = (
     Motion._fields.index(name) for name in ("psi", "theta", "omega_l", "omega_r")
 )
@@ -121,6 +123,11 @@ class Record:
     def robots(self) -> int:
         """How many robots."""
         return len(self.lost_at_s)
+
+    @property
+    def contact(self) -> bool:
+        """Whether any two robots touched."""
+        return bool(np.isfinite(self.touched_at_s).any())
 
     def metrics(self) -> list[RobotMetrics]:
         """The summary of every robot."""
@@ -153,38 +160,104 @@ def run_policy(
     """
     formation = Formation(scenario.model_copy(update={"end_on": ()}), parts)
     formation.reset(checked_seed(seed))
-    a = formation.arrays
-    n, steps = scenario.robot_count, scenario.horizon_steps
-    infos = np.zeros((steps + 1, n, len(Info._fields)))
-    wheels = np.zeros((steps + 1, 5, n))  # castor angle, speeds, speeds asked for
-    lost_at_s, touched_at_s = np.full(n, np.inf), np.full(n, np.inf)
-    seen = a.sensor_observations[0] if scenario.observation == "sensor" else a.observations[0]
-    state: Any = None
-    start = np.ones(n, dtype=np.bool_)
-    _note(a, infos, wheels, 0)
+    a, steps = formation.arrays, scenario.horizon_steps
+    tape = _Tape(a, steps)
+    driver = _Driver(policy, scenario, a)
     for k in range(1, steps + 1):
-        actions, state = policy.predict(seen.copy(), state, start, True)
-        a.actions[0] = checked_actions(actions, a.actions.shape[1:])
-        start = np.zeros(n, dtype=np.bool_)
+        a.actions[:] = driver.act()
         formation.step()
-        _note(a, infos, wheels, k)
-        if a.lost_now.any() or a.touched_now.any():
-            lost_at_s[a.lost_now[0]] = k * scenario.control_period_s
-            touched_at_s[a.touched_now[0]] = k * scenario.control_period_s
+        tape.note(k, scenario.control_period_s)
         if progress is not None:
             progress(k, steps)
-    columns = {name: infos[:, :, Info._fields.index(name)] for name in FROM_INFO}
-    columns |= {name: wheels[:, i] for i, name in enumerate(FROM_WHEELS)}
-    return Record(
-        scenario=scenario,
-        seed=seed,
-        policy=name,
-        t_s=np.arange(steps + 1) * scenario.control_period_s,
-        columns=_with_functionals(columns, scenario.control_period_s),
-        leader=a.table[: steps + 1, :2].copy(),
-        lost_at_s=lost_at_s,
-        touched_at_s=touched_at_s,
-    )
+    return tape.record(0, scenario, seed, name)
+
+
+def run_seeds(
+    scenario: Scenario, policy: Policy, seeds: Sequence[int], *, name: str = "policy"
+) -> Iterator[Record]:
+    """The runs of several seeds side by side, without contact between robots; as :func:`run_policy`.
+
+    The policy is asked once a step for all rows, ``(seed · robots, entry)``; one that can only take the
+    rows of one formation is asked seed by seed.
+    """
+    plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds))
+    plant.reset(list(seeds))
+    a, steps = plant.arrays, scenario.horizon_steps
+    tape = _Tape(a, steps)
+    driver = _Driver(policy, scenario, a)
+    try:
+        actions = driver.act()
+    except ValueError:
+        if len(seeds) == 1:
+            raise
+        for seed in seeds:
+            yield from run_seeds(scenario, policy, [seed], name=name)
+        return
+    for k in range(1, steps + 1):
+        plant.step(actions)
+        tape.note(k, scenario.control_period_s)
+        if k < steps:
+            actions = driver.act()
+    for lane, seed in enumerate(seeds):
+        yield tape.record(lane, scenario, seed, name)
+
+
+class _Driver:
+    """A policy and what it remembers of an episode."""
+
+    def __init__(self, policy: Policy, scenario: Scenario, a: Arrays) -> None:
+        self._policy = policy
+        self._seen = a.sensor_observations if scenario.observation == "sensor" else a.observations
+        self._shape = a.actions.shape
+        self._state: Any = None
+        self._start = np.ones(self._shape[0] * self._shape[1], dtype=np.bool_)
+
+    def act(self) -> np.ndarray:
+        """Actions for all robots of all lanes."""
+        rows = self._seen.reshape(len(self._start), -1).copy()
+        actions, self._state = self._policy.predict(rows, self._state, self._start, True)
+        self._start = np.zeros_like(self._start)
+        return checked_actions(actions, (len(rows), self._shape[2])).reshape(self._shape)
+
+
+class _Tape:
+    """Everything that a record needs of a run of some lanes, row by row."""
+
+    def __init__(self, a: Arrays, steps: int) -> None:
+        lanes, n = a.rewards.shape
+        self._arrays, self._steps = a, steps
+        self._infos = np.zeros((lanes, steps + 1, n, len(FROM_INFO)))
+        self._wheels = np.zeros((lanes, steps + 1, len(FROM_WHEELS), n))
+        self._lost_at_s, self._touched_at_s = np.full((2, lanes, n), np.inf)
+        self.note(0, 0.0)
+
+    def note(self, k: int, period_s: float) -> None:
+        """Row ``k``."""
+        a = self._arrays
+        self._infos[:, k] = a.infos[:, :, INFO_PLACES]
+        self._wheels[:, k, 0] = (a.motions[PSI] - a.motions[THETA]).T
+        self._wheels[:, k, 1] = a.motions[OMEGA_L].T
+        self._wheels[:, k, 2] = a.motions[OMEGA_R].T
+        self._wheels[:, k, 3:] = a.wanted.transpose(2, 0, 1)
+        if a.lost_now.any() or a.touched_now.any():
+            self._lost_at_s[a.lost_now] = k * period_s
+            self._touched_at_s[a.touched_now] = k * period_s
+
+    def record(self, lane: int, scenario: Scenario, seed: int, policy: str) -> Record:
+        """The record of a lane."""
+        period_s = scenario.control_period_s
+        columns = {name: self._infos[lane, :, :, i] for i, name in enumerate(FROM_INFO)}
+        columns |= {name: self._wheels[lane, :, i] for i, name in enumerate(FROM_WHEELS)}
+        return Record(
+            scenario=scenario,
+            seed=seed,
+            policy=policy,
+            t_s=np.arange(self._steps + 1) * period_s,
+            columns=_with_functionals(columns, period_s),
+            leader=self._arrays.table[: self._steps + 1, :2].copy(),
+            lost_at_s=self._lost_at_s[lane],
+            touched_at_s=self._touched_at_s[lane],
+        )
 
 
 def checked_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
@@ -199,14 +272,6 @@ def checked_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
     if array.shape != shape:
         raise ValueError(f"the policy's actions must have the shape {shape}, got {array.shape}")
     return array
-
-
-def _note(a: Arrays, infos: np.ndarray, wheels: np.ndarray, k: int) -> None:
-    infos[k] = a.infos[0]
-    wheels[k, 0] = a.motions[PSI, :, 0] - a.motions[THETA, :, 0]
-    wheels[k, 1] = a.motions[OMEGA_L, :, 0]
-    wheels[k, 2] = a.motions[OMEGA_R, :, 0]
-    wheels[k, 3:] = a.wanted[:, :, 0]
 
 
 def _with_functionals(rows: dict[str, np.ndarray], period_s: float) -> dict[str, np.ndarray]:

@@ -79,7 +79,9 @@ def run(
     observer: Annotated[str | None, typer.Option(help="module:factory of an observer.")] = None,
     seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     robots: Annotated[int | None, typer.Option(help="How many robots.")] = None,
-    plant: Annotated[str | None, typer.Option(help="pymunk or kinematic.")] = None,
+    plant: Annotated[
+        str | None, typer.Option(help="pymunk, batch (no contact) or kinematic.")
+    ] = None,
     control_period_s: Annotated[float | None, typer.Option(help="Period of the policy, s.")] = None,
     horizon_s: Annotated[float | None, typer.Option(help="Length of the run, s.")] = None,
     out: Annotated[
@@ -97,7 +99,7 @@ def run(
     """Drive a policy through a scenario to the horizon; a table, a summary, data and figures."""
     from baselines.policies import enter
     from baselines.run import run_policy, summary, write_mat, write_record
-    from tlf_env.envs.parallel import checked_seed
+    from tlf_env.numerics.philox import checked_seed
     from tlf_env.task.scenario import load_scenario, scenario_warnings
 
     chosen = load_scenario(
@@ -265,6 +267,10 @@ def bench(
         ),
     ] = None,
     horizon_s: Annotated[float | None, typer.Option(help="Length of each run, s.")] = None,
+    plant: Annotated[
+        str | None,
+        typer.Option(help="pymunk, batch (seeds side by side, no contact) or kinematic."),
+    ] = None,
     processes: Annotated[int, typer.Option(help="Processes on this machine; 0: one per core.")] = 0,
     ray: Annotated[
         str | None, typer.Option(help="Address of an existing Ray cluster to run on instead.")
@@ -292,7 +298,11 @@ def bench(
         level=level,
         sweep=path,
         sweep_values=values,
-        overrides=() if horizon_s is None else (("horizon_s", horizon_s),),
+        overrides=tuple(
+            (field, value)
+            for field, value in (("horizon_s", horizon_s), ("plant", plant))
+            if value is not None
+        ),
         trust=trust,
     )
     with progress_bar("bench") as update:

@@ -3,20 +3,26 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from tlf_env.numerics.compiled import reader, writer
-from tlf_env.onboard.estimator import Estimate, ekf_constants
+from tlf_env.onboard.estimator import Ekf, Estimate, ekf_constants
 from tlf_env.onboard.observer import Message, Reference
-from tlf_env.onboard.slip_estimator import SlipEstimate, slip_ekf_constants
-from tlf_env.onboard.wheel_loop import WheelLoopParameters, WheelLoopState, digital_wheel_loop
-from tlf_env.physics.parameters import body_array
+from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate, slip_ekf_constants
+from tlf_env.onboard.wheel_loop import (
+    WheelLoop,
+    WheelLoopParameters,
+    WheelLoopState,
+    digital_wheel_loop,
+)
+from tlf_env.physics.parameters import Body, body_array
 from tlf_env.physics.state import Contact, Motion
 from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
 from tlf_env.task.channels import CHANNELS, DEAD_TIME, JITTER
-from tlf_env.task.disturbance import Effects, leveled, patch_rows, signal_rows
+from tlf_env.task.disturbance import Effects, PatchRow, leveled, patch_rows, signal_rows
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.reward import RewardTerms
@@ -82,6 +88,9 @@ class Info(NamedTuple):
     clipped: float
 
 
+RUNNING, LOST, TOUCHED, OTHER_ROBOT, HORIZON = range(5)
+END_REASONS = ("", "lost", "touched", "other_robot", "horizon")
+
 INFO_MEANINGS = {
     "position_error_mm": "true position of c to the robot's own reference (leader: the path)",
     "formation_error_mm": "true position to ref(t − i·gap), at rest at ref(0) before",
@@ -130,18 +139,34 @@ class State(NamedTuple):
     reference_y_mm: float
 
 
-class Arrays(NamedTuple):
-    """``(field, robot, lane)`` unless said; a lane is one formation."""
+class Variants(NamedTuple):
+    """Constants of the scenarios that lanes may run, as an episode's start needs them."""
 
+    bodies: np.ndarray  # (field, robot, variant), without payload
+    wheel_loops: np.ndarray  # (field, robot, variant)
+    ekfs: np.ndarray  # (field, robot, variant)
+    slip_ekfs: np.ndarray  # (field, robot, variant)
+    levels: np.ndarray  # (variant,) of the disturbance
+    mixture: np.ndarray  # (variant,): summed shares if every episode draws its variant, else empty
+
+
+class Arrays(NamedTuple):
+    """``(field, robot, lane)`` unless said; a lane is one formation.
+
+    Lanes may run different scenarios, their :class:`Variants`.
+    """
+
+    # constants of the variants
+    signals: np.ndarray  # (variant, channel, SignalRow)
+    patches: np.ndarray  # (variant, patch, PatchRow)
+    table: np.ndarray  # (step, Reference): the leader's reference at the control steps
     # constants of an episode
+    variants: np.ndarray  # (lane,) int64
     bodies: np.ndarray
     wheel_loops: np.ndarray
     ekfs: np.ndarray
     slip_ekfs: np.ndarray
     levels: np.ndarray  # (lane,) of the disturbance
-    signals: np.ndarray  # (channel, SignalRow)
-    patches: np.ndarray  # (patch, PatchRow)
-    table: np.ndarray  # (step, Reference): the leader's reference at the control steps
     # physics
     motions: np.ndarray
     contacts: np.ndarray
@@ -186,6 +211,7 @@ class Arrays(NamedTuple):
     touched: np.ndarray
     lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
     touched_now: np.ndarray
+    ends: np.ndarray  # (lane, robot) int8: why the episode ended in this step, as in END_REASONS
     scales: np.ndarray  # (entry,) of `tracking`
     sensor_scales: np.ndarray  # (entry,) of `sensor`
     weights: np.ndarray  # (RewardTerms,)
@@ -204,6 +230,23 @@ def _constant(row: tuple[float, ...], robots: int, lanes: int) -> np.ndarray:
     return np.tile(np.array(row, dtype=np.float64)[:, None, None], (1, robots, lanes))
 
 
+def _per_variant(rows: Sequence[tuple[float, ...]], robots: int) -> np.ndarray:
+    """Rows of the variants as (field, robot, variant), every robot alike."""
+    return np.ascontiguousarray(np.repeat(np.array(rows).T[:, None, :], robots, axis=1))
+
+
+NOWHERE = PatchRow(x=math.inf, y=0.0, radius=0.0, scale=1.0)
+
+
+def _all_patches(scenarios: Sequence[Scenario]) -> np.ndarray:
+    """Patches as (variant, patch, PatchRow), filled up with patches that nothing lies on."""
+    rows = [patch_rows(scenario.disturbance) for scenario in scenarios]
+    out = np.tile(np.array(NOWHERE), (len(rows), max(map(len, rows)), 1))
+    for patches, some in zip(out, rows, strict=True):
+        patches[: len(some)] = some
+    return out
+
+
 def longest(scenario: Scenario, channel: int) -> float:
     """The largest value that a channel can have; its range's end if an adversary may set it."""
     if scenario.adversary:
@@ -213,12 +256,39 @@ def longest(scenario: Scenario, channel: int) -> float:
     return max(leveled(CHANNELS[channel].nominal, end, level) for end in reach)
 
 
-def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays:
-    """Arrays of ``lanes`` formations, not yet reset."""
-    n = scenario.robot_count
+def _loop_row(scenario: Scenario) -> tuple[float, ...]:
     wheel_loop = scenario.wheel_loop
     if isinstance(wheel_loop, str):  # an object outside; the arrays' own loop rests
         wheel_loop = WheelLoopParameters()
+    return digital_wheel_loop(wheel_loop, scenario.physics_period_s)
+
+
+def make_variants(scenarios: Sequence[Scenario], mixture: Sequence[float] = ()) -> Variants:
+    """Constants of the scenarios; with the shares ``mixture``, which sum to 1, episodes draw theirs."""
+    n = scenarios[0].robot_count
+    return Variants(
+        bodies=np.concatenate([body_array(list(one.robot_models)) for one in scenarios], axis=2),
+        wheel_loops=_per_variant([_loop_row(one) for one in scenarios], n),
+        ekfs=_per_variant([ekf_constants(one.ekf) for one in scenarios], n),
+        slip_ekfs=_per_variant(
+            [slip_ekf_constants(one.ekf_slip, one.physics_period_s) for one in scenarios], n
+        ),
+        levels=np.array([one.disturbance.level for one in scenarios]),
+        mixture=np.cumsum(np.array(mixture, dtype=np.float64)),
+    )
+
+
+def make_arrays(
+    scenarios: Sequence[Scenario],
+    table: np.ndarray,
+    lanes: int = 1,
+) -> Arrays:
+    """Arrays of ``lanes`` formations, not yet reset; lane k runs scenario k modulo their number.
+
+    The scenarios may differ in their robots' parameters, wheel loops, filters and disturbances only.
+    """
+    scenario = scenarios[0]
+    n = scenario.robot_count
     dtype = np.dtype(scenario.dtype)
     sensor = len(sensor_entries(scenario.substeps)) if scenario.observation == "sensor" else 0
     gap = scenario.gap_steps
@@ -226,26 +296,28 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
     lookahead = max(scenario.preview_steps, default=0)
     entries = len(tracking_entries(scenario.preview_s))
 
-    dead = round(longest(scenario, DEAD_TIME) / scenario.physics_period_s)
-    late = math.ceil(longest(scenario, JITTER) / scenario.control_period_s)
+    dead = max(round(longest(one, DEAD_TIME) / one.physics_period_s) for one in scenarios)
+    late = max(math.ceil(longest(one, JITTER) / one.control_period_s) for one in scenarios)
     ring = gap + 1 + late
 
     def zeros(fields: int) -> np.ndarray:
         return np.zeros((fields, n, lanes))
 
     return Arrays(
-        bodies=body_array(list(scenario.robot_models), lanes),
-        wheel_loops=_constant(digital_wheel_loop(wheel_loop, scenario.physics_period_s), n, lanes),
-        ekfs=_constant(ekf_constants(scenario.ekf), n, lanes),
-        slip_ekfs=_constant(
-            slip_ekf_constants(scenario.ekf_slip, scenario.physics_period_s), n, lanes
+        signals=np.array(
+            [
+                signal_rows(one.disturbance, one.physics_period_s, one.control_period_s)
+                for one in scenarios
+            ]
         ),
-        levels=np.full(lanes, scenario.disturbance.level),
-        signals=signal_rows(
-            scenario.disturbance, scenario.physics_period_s, scenario.control_period_s
-        ),
-        patches=patch_rows(scenario.disturbance),
+        patches=_all_patches(scenarios),
         table=table.copy(),
+        variants=np.arange(lanes) % len(scenarios),
+        bodies=zeros(len(Body._fields)),
+        wheel_loops=zeros(len(WheelLoop._fields)),
+        ekfs=zeros(len(Ekf._fields)),
+        slip_ekfs=zeros(len(SlipEkf._fields)),
+        levels=np.zeros(lanes),
         motions=zeros(len(Motion._fields)),
         contacts=zeros(len(Contact._fields)),
         processes=zeros(len(CHANNELS)),
@@ -282,6 +354,7 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         touched=np.zeros((lanes, n), dtype=np.bool_),
         lost_now=np.zeros((lanes, n), dtype=np.bool_),
         touched_now=np.zeros((lanes, n), dtype=np.bool_),
+        ends=np.zeros((lanes, n), dtype=np.int8),
         scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
         sensor_scales=np.array(
             [entry.scale for entry in sensor_entries(scenario.substeps).values()]

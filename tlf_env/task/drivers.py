@@ -11,7 +11,6 @@ from __future__ import annotations
 import numpy as np
 
 from tlf_env.numerics.compiled import block, driver, law
-from tlf_env.numerics.philox import normal_pair
 from tlf_env.onboard.estimator import read_ekf, read_estimate, write_estimate
 from tlf_env.onboard.observer import Message
 from tlf_env.onboard.slip_estimator import (
@@ -21,13 +20,7 @@ from tlf_env.onboard.slip_estimator import (
 )
 from tlf_env.onboard.wheel_loop import read_loop_state, read_wheel_loop, write_loop_state
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
-from tlf_env.physics.state import (
-    read_body,
-    read_contact,
-    read_motion,
-    write_contact,
-    write_motion,
-)
+from tlf_env.physics.state import read_body, read_contact, read_motion, write_contact, write_motion
 from tlf_env.task.actions import (
     FULL_RESIDUAL_MM_S,
     FULL_RESIDUAL_RAD_S,
@@ -43,7 +36,9 @@ from tlf_env.task.actions import (
     wheel_command,
 )
 from tlf_env.task.arrays import (
+    RUNNING,
     Arrays,
+    Variants,
     read_effects,
     read_sensors,
     read_trace,
@@ -54,6 +49,7 @@ from tlf_env.task.arrays import (
 from tlf_env.task.channels import STEP_CHANNELS, SUBSTEP_CHANNELS
 from tlf_env.task.judging import (
     CLIPPED,
+    end_lane,
     judge_robot,
     observe_robot,
     observe_sensors,
@@ -62,16 +58,18 @@ from tlf_env.task.judging import (
 from tlf_env.task.outlines import mark_touched, room_to_move
 from tlf_env.task.radio import broadcast, delayed_message, next_reference
 from tlf_env.task.settings import Settings
+from tlf_env.task.starting import STARTED, fill, start_lane
 from tlf_env.task.substeps import (
     EXTERNAL_TORQUE,
     actuate_robot,
-    advance,
     delays,
     evaluate,
+    move_lane,
     sense_robot,
 )
 
-DONE, MUST_COLLIDE = -1, -2
+DONE, MUST_COLLIDE, MUST_SUBSTEP = -1, -2, -3
+LANES_AT_ONCE = 16  # whose arrays stay in the processor's cache during a step
 
 
 @law
@@ -94,38 +92,39 @@ def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
 
 
 @block
-def take_actions(a: Arrays, s: Settings) -> int:
-    """Clip the actions and turn them into commands; clears the traces.
-
-    Returns ``DONE``, or lane · robots + robot of the first action that is not finite; then nothing changes.
-    """
-    lanes, robots = a.actions.shape[0], a.actions.shape[1]
-    for lane in range(lanes):
+def first_bad_action(a: Arrays, first: int, last: int) -> int:
+    """``DONE``, or lane · robots + robot of the first action that is not finite."""
+    robots = a.actions.shape[1]
+    for lane in range(first, last):
         for r in range(robots):
             if not (np.isfinite(a.actions[lane, r, 0]) and np.isfinite(a.actions[lane, r, 1])):
                 return lane * robots + r
-    for lane in range(lanes):
-        for r in range(robots):
-            if a.kinds[r, lane] == REFERENCE:
-                given = a.twists[lane, r]
-                given[0], given[1] = reference_action(a.observations[lane, r], a.scales, s.base)
-                a.actions[lane, r, 0], a.actions[lane, r, 1] = given[0], given[1]
-            a_0, a_1 = limited(a.actions[lane, r, 0]), limited(a.actions[lane, r, 1])
-            clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]
-            if clipped:
-                a.infos[lane, r, CLIPPED] += 1.0
-            a.actions[lane, r, 0], a.actions[lane, r, 1] = a_0, a_1
-            a.wanted_before[0, r, lane] = a.wanted[0, r, lane]
-            a.wanted_before[1, r, lane] = a.wanted[1, r, lane]
-            a.wanted[0, r, lane], a.wanted[1, r, lane] = command(a, lane, r, s)
-            a.commands[0, r, lane] = a.wanted[0, r, lane]
-            a.commands[1, r, lane] = a.wanted[1, r, lane]
-            evaluate(a, lane, r, SUBSTEP_CHANNELS, STEP_CHANNELS, a.clock[lane, 0], s)
-            if s.adversary and not s.changing:
-                evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, a.clock[lane, 0], s)
-            a.lost_now[lane, r] = a.touched_now[lane, r] = False
-    a.traces[:] = 0.0
     return DONE
+
+
+@block
+def take_actions(a: Arrays, lane: int, s: Settings) -> None:
+    """Clip the actions of a lane and turn them into commands; clears the traces."""
+    for r in range(a.actions.shape[1]):
+        if a.kinds[r, lane] == REFERENCE:
+            given = a.twists[lane, r]
+            given[0], given[1] = reference_action(a.observations[lane, r], a.scales, s.base)
+            a.actions[lane, r, 0], a.actions[lane, r, 1] = given[0], given[1]
+        a_0, a_1 = limited(a.actions[lane, r, 0]), limited(a.actions[lane, r, 1])
+        clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]
+        if clipped:
+            a.infos[lane, r, CLIPPED] += 1.0
+        a.actions[lane, r, 0], a.actions[lane, r, 1] = a_0, a_1
+        a.wanted_before[0, r, lane] = a.wanted[0, r, lane]
+        a.wanted_before[1, r, lane] = a.wanted[1, r, lane]
+        a.wanted[0, r, lane], a.wanted[1, r, lane] = command(a, lane, r, s)
+        a.commands[0, r, lane] = a.wanted[0, r, lane]
+        a.commands[1, r, lane] = a.wanted[1, r, lane]
+        evaluate(a, lane, r, SUBSTEP_CHANNELS, STEP_CHANNELS, a.clock[lane, 0], s)
+        if s.adversary and not s.changing:
+            evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, a.clock[lane, 0], s)
+        a.lost_now[lane, r] = a.touched_now[lane, r] = False
+    fill(a.traces, lane, 0.0)
 
 
 @block
@@ -151,6 +150,7 @@ def look_lane(a: Arrays, lane: int, s: Settings) -> None:
     if s.cooperative:
         mean = a.rewards[lane].mean()
         a.rewards[lane, :] = mean
+    end_lane(a, lane, s)
 
 
 @block
@@ -163,159 +163,157 @@ def conclude_lane(a: Arrays, lane: int, s: Settings) -> None:
 
 
 @driver
-def actuate(a: Arrays, k: int, s: Settings) -> None:
-    """The first half of substep ``k`` of lane 0: everything up to the plant's new velocities and poses."""
-    tick = a.clock[0, 0]
+def delayed_message_of(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
+    """:func:`delayed_message`, for observers outside."""
+    return delayed_message(a, lane, r, step, s)
+
+
+@driver
+def delays_of(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
+    """:func:`delays`, for wheel loops outside."""
+    return delays(a, lane, r, dt)
+
+
+@driver
+def start(
+    a: Arrays, of: Variants, mask: np.ndarray, poses: np.ndarray, s: Settings
+) -> tuple[int, int, int]:
+    """:func:`start_lane` of every lane of the mask, up to the first that fails.
+
+    Returns its result and the lane. :func:`look` comes after it.
+    """
+    for lane in range(mask.shape[0]):
+        if mask[lane]:
+            result, robot = start_lane(a, of, lane, poses, s)
+            if result != STARTED:
+                return result, robot, lane
+    return STARTED, 0, 0
+
+
+@driver
+def look(a: Arrays, mask: np.ndarray, at_start: bool, s: Settings) -> None:
+    """:func:`look_lane` of the lanes of the mask; who starts lost is lost in the first step."""
+    for lane in range(mask.shape[0]):
+        if mask[lane]:
+            look_lane(a, lane, s)
+            if at_start:
+                for r in range(a.ends.shape[1]):
+                    a.lost[lane, r] = a.lost_now[lane, r] = False
+                    a.ends[lane, r] = RUNNING
+
+
+@driver
+def transmit(a: Arrays, lane: int, s: Settings) -> None:
+    """:func:`transmit_lane`."""
+    transmit_lane(a, lane, s)
+
+
+@driver
+def refer(a: Arrays, lane: int, first: int, last: int, s: Settings) -> None:
+    """The next references of the robots from ``first`` to before ``last``."""
+    for r in range(first, last):
+        next_reference(a, lane, r, a.clock[lane, 1] + s.lookahead, s)
+
+
+@block
+def are_near(a: Arrays, lane: int, s: Settings) -> bool:
+    """Whether outlines could meet within the control step; without torques only its end counts."""
+    return not s.kinematic and not room_to_move(a, lane, s.period)
+
+
+@driver
+def actuate(a: Arrays, lane: int, k: int, s: Settings) -> None:
+    """The first half of substep ``k`` of a lane: everything up to the plant's new velocities and poses."""
+    tick = a.clock[lane, 0]
     for r in range(a.motions.shape[1]):
-        kind = a.kinds[r, 0]
+        kind = a.kinds[r, lane]
         if s.external_wheel_loop and kind != TORQUE:
             kind = EXTERNAL_TORQUE
         if s.changing:
-            evaluate(a, 0, r, 0, SUBSTEP_CHANNELS, tick, s)
-        dead, hold = delays(a, 0, r, s.dt)
-        wanted_l, wanted_r = a.commands[0, r, 0], a.commands[1, r, 0]
+            evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, tick, s)
+        dead, hold = delays(a, lane, r, s.dt)
+        wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
         if k < hold and kind != EXTERNAL_TORQUE:
-            wanted_l, wanted_r = a.wanted_before[0, r, 0], a.wanted_before[1, r, 0]
+            wanted_l, wanted_r = a.wanted_before[0, r, lane], a.wanted_before[1, r, lane]
         motion, contact, held, trace = actuate_robot(
-            read_body(a.bodies, r, 0),
-            read_wheel_loop(a.wheel_loops, r, 0),
-            read_effects(a.applied, r, 0),
-            read_motion(a.motions, r, 0),
-            read_contact(a.contacts, r, 0),
-            read_loop_state(a.loop_states, r, 0),
-            read_sensors(a.sensors, r, 0),
-            read_trace(a.traces, r, 0),
+            read_body(a.bodies, r, lane),
+            read_wheel_loop(a.wheel_loops, r, lane),
+            read_effects(a.applied, r, lane),
+            read_motion(a.motions, r, lane),
+            read_contact(a.contacts, r, lane),
+            read_loop_state(a.loop_states, r, lane),
+            read_sensors(a.sensors, r, lane),
+            read_trace(a.traces, r, lane),
             kind,
             wanted_l,
             wanted_r,
-            a.patches,
-            a.torques[:, :, r, 0],
+            a.patches[a.variants[lane]],
+            a.torques[:, :, r, lane],
             dead,
             tick + 1,
             s.kinematic,
             s.dt,
         )
-        write_motion(a.motions, r, 0, motion)
-        write_contact(a.contacts, r, 0, contact)
-        write_loop_state(a.loop_states, r, 0, held)
-        write_trace(a.traces, r, 0, trace)
+        write_motion(a.motions, r, lane, motion)
+        write_contact(a.contacts, r, lane, contact)
+        write_loop_state(a.loop_states, r, lane, held)
+        write_trace(a.traces, r, lane, trace)
 
 
 @driver
-def sense(a: Arrays, k: int, s: Settings) -> None:
-    """The second half of substep ``k`` of lane 0: sensors and estimator, and which outlines meet."""
-    tick = a.clock[0, 0] + 1
+def sense(a: Arrays, lane: int, k: int, s: Settings) -> None:
+    """The second half of substep ``k`` of a lane: sensors and estimator, and which outlines meet."""
+    tick = a.clock[lane, 0] + 1
     for r in range(a.motions.shape[1]):
         sensors, estimate, slip, trace, sample = sense_robot(
-            read_body(a.bodies, r, 0),
-            read_ekf(a.ekfs, r, 0),
-            read_slip_ekf(a.slip_ekfs, r, 0),
-            read_effects(a.applied, r, 0),
-            read_motion(a.motions, r, 0),
-            read_sensors(a.sensors, r, 0),
-            read_estimate(a.estimates, r, 0),
-            read_slip_estimate(a.slip_estimates, r, 0),
-            read_trace(a.traces, r, 0),
-            a.seeds[0],
-            a.clock[0, 2],
+            read_body(a.bodies, r, lane),
+            read_ekf(a.ekfs, r, lane),
+            read_slip_ekf(a.slip_ekfs, r, lane),
+            read_effects(a.applied, r, lane),
+            read_motion(a.motions, r, lane),
+            read_sensors(a.sensors, r, lane),
+            read_estimate(a.estimates, r, lane),
+            read_slip_estimate(a.slip_estimates, r, lane),
+            read_trace(a.traces, r, lane),
+            a.seeds[lane],
+            a.clock[lane, 2],
             r,
             tick,
             s.estimator,
             s.dt,
         )
-        write_sample(a.samples[k], r, 0, sample)
-        write_sensors(a.sensors, r, 0, sensors)
-        write_estimate(a.estimates, r, 0, estimate)
-        write_slip_estimate(a.slip_estimates, r, 0, slip)
-        write_trace(a.traces, r, 0, trace)
-    a.clock[0, 0] = tick
-    mark_touched(a, 0)
+        write_sample(a.samples[k], r, lane, sample)
+        write_sensors(a.sensors, r, lane, sensors)
+        write_estimate(a.estimates, r, lane, estimate)
+        write_slip_estimate(a.slip_estimates, r, lane, slip)
+        write_trace(a.traces, r, lane, trace)
+    a.clock[lane, 0] = tick
+    mark_touched(a, lane)
 
 
 @driver
-def delayed_message_of(a: Arrays, r: int, step: int, s: Settings) -> Message:
-    """:func:`delayed_message` of lane 0, for observers outside."""
-    return delayed_message(a, 0, r, step, s)
+def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
+    """A whole control step of the lanes from ``first`` to before ``last``.
 
-
-@driver
-def delays_of(a: Arrays, r: int, dt: float) -> tuple[int, int]:
-    """:func:`delays` of lane 0, for wheel loops outside."""
-    return delays(a, 0, r, dt)
-
-
-@driver
-def draw_episode(a: Arrays, lane: int, s: Settings) -> None:
-    """All channels at the start of an episode; before the poses are set."""
-    for r in range(a.motions.shape[1]):
-        evaluate(a, lane, r, 0, a.signals.shape[0], 0, s)
-
-
-@driver
-def draw_normals(a: Arrays, lane: int, stream: int, r: int, index: int) -> tuple[float, float]:
-    """Two standard normal numbers of a robot's stream in this episode."""
-    return normal_pair(a.seeds[lane], stream, r, a.clock[lane, 2], index)
-
-
-@driver
-def begin(a: Arrays, lane: int, s: Settings) -> None:
-    """After the poses of a lane are set: first messages, and references up to the preview."""
-    robots = a.motions.shape[1]
-    for r in range(robots):
-        broadcast(a, lane, r, 0, s)
-        record_truth(a, lane, r, 0)
-    for r in range(robots):
-        if r == 0 or not s.external_observer:
-            for m in range(s.lookahead + 1):
-                next_reference(a, lane, r, m, s)
-
-
-@driver
-def transmit(a: Arrays, s: Settings) -> None:
-    """:func:`transmit_lane` of lane 0, and the leader's next reference."""
-    transmit_lane(a, 0, s)
-    next_reference(a, 0, 0, a.clock[0, 1] + s.lookahead, s)
-
-
-@driver
-def observe_followers(a: Arrays, s: Settings) -> None:
-    """The followers' next references in lane 0."""
-    for r in range(1, a.motions.shape[1]):
-        next_reference(a, 0, r, a.clock[0, 1] + s.lookahead, s)
-
-
-@driver
-def look(a: Arrays, s: Settings) -> None:
-    """:func:`look_lane` of lane 0."""
-    look_lane(a, 0, s)
-
-
-@driver
-def prepare(a: Arrays, s: Settings) -> int:
-    """Take the actions of lane 0; returns as :func:`control_step` does, ``MUST_COLLIDE`` if near."""
-    bad = take_actions(a, s)
-    if bad != DONE:
-        return bad
-    if not s.kinematic and not room_to_move(a, 0, s.period):
-        return MUST_COLLIDE
-    return DONE
-
-
-@driver
-def control_step(a: Arrays, s: Settings) -> int:
-    """A whole control step of lane 0.
-
-    Returns ``DONE``; or the number of the first robot whose action is not finite, and nothing has
-    changed; or ``MUST_COLLIDE``: robots are close, actions are taken, and the substeps are left to
-    the plant's space.
+    Returns ``DONE``; or the number of the first robot whose action is not finite (see
+    :func:`first_bad_action`), and nothing has changed. For a single lane also ``MUST_COLLIDE`` or
+    ``MUST_SUBSTEP``: actions are taken, and the substeps are left to the plant's space, because robots
+    are close, or to Python, because there are parts that live there.
     """
-    bad = take_actions(a, s)
+    bad = first_bad_action(a, first, last)
     if bad != DONE:
         return bad
-    if not s.kinematic and not room_to_move(a, 0, s.period):
-        return MUST_COLLIDE
-    advance(a, 0, s)
-    if s.kinematic:
-        mark_touched(a, 0)
-    conclude_lane(a, 0, s)
+    for start in range(first, last, LANES_AT_ONCE):
+        end = min(start + LANES_AT_ONCE, last)
+        for lane in range(start, end):
+            take_actions(a, lane, s)
+        for lane in range(start, end):
+            near = are_near(a, lane, s)
+            if near and s.collides:
+                return MUST_COLLIDE
+            if s.has_parts:
+                return MUST_SUBSTEP
+            move_lane(a, lane, near, s)
+        for lane in range(start, end):
+            conclude_lane(a, lane, s)
     return DONE

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import block, law
 from tlf_env.onboard.estimator import odometry, read_estimate
@@ -12,7 +14,16 @@ from tlf_env.onboard.tracking import body_errors
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Body
 from tlf_env.physics.state import axle_midpoint, read_body, read_motion
 from tlf_env.task.actions import TORQUE
-from tlf_env.task.arrays import Arrays, Info, read_trace
+from tlf_env.task.arrays import (
+    HORIZON,
+    LOST,
+    OTHER_ROBOT,
+    RUNNING,
+    TOUCHED,
+    Arrays,
+    Info,
+    read_trace,
+)
 from tlf_env.task.measures import distance, time_gap_error
 from tlf_env.task.observation import SensorTail, Tracking, preview_entries, scaled
 from tlf_env.task.radio import DELTA_1, DELTA_2, delayed_message, read_reference
@@ -181,3 +192,33 @@ def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
         a.terms[lane, r, i] = terms[i]
         total += a.weights[i] * terms[i]
     a.rewards[lane, r] = total
+
+
+@block
+def end_lane(a: Arrays, lane: int, s: Settings) -> None:
+    """Whether and why the episode ended in this step: for the whole formation at once.
+
+    See :func:`terminated` and :func:`truncated`.
+    """
+    rest = HORIZON if a.clock[lane, 1] >= s.horizon else RUNNING
+    for r in range(a.ends.shape[1]):
+        a.ends[lane, r] = RUNNING
+        if s.end_on_lost and a.lost_now[lane, r]:
+            a.ends[lane, r] = LOST
+        if s.end_on_touched and a.touched_now[lane, r]:
+            a.ends[lane, r] = TOUCHED
+        if a.ends[lane, r] != RUNNING:
+            rest = OTHER_ROBOT
+    for r in range(a.ends.shape[1]):
+        if a.ends[lane, r] == RUNNING:
+            a.ends[lane, r] = rest
+
+
+def terminated(ends: np.ndarray) -> np.ndarray:
+    """Who ended the episode, of any shape: who was lost or touched another."""
+    return (ends == LOST) | (ends == TOUCHED)
+
+
+def truncated(ends: np.ndarray) -> np.ndarray:
+    """Whose episode was ended by another robot or the horizon, of any shape."""
+    return (ends == OTHER_ROBOT) | (ends == HORIZON)

@@ -16,7 +16,6 @@ from tlf_env.task.settings import Settings
 SPEEDS = [Sensors._fields.index("speed_l"), Sensors._fields.index("speed_r")]
 STEPS = [Sample._fields.index("step_l"), Sample._fields.index("step_r")]
 FIXES = [Sample._fields.index("fix_x"), Sample._fields.index("fix_y")]
-BUILT_IN_ESTIMATORS = ("ekf", "ekf-slip", "truth")
 
 
 def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[str, Factory]:
@@ -27,20 +26,13 @@ def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[s
     ValueError
         for a part that cannot be imported.
     """
-    named = {
-        "estimator": scenario.estimator if scenario.estimator not in BUILT_IN_ESTIMATORS else None,
-        "wheel_loop": scenario.wheel_loop,
-        "observer": scenario.observer,
-    }
     return {
-        role: at_hand.get(role) or load_part(path)
-        for role, path in named.items()
-        if isinstance(path, str)
+        role: at_hand.get(role) or load_part(path) for role, path in scenario.part_paths.items()
     }
 
 
 class Parts:
-    """One object per robot and role; false if there is none."""
+    """One object per robot and role."""
 
     def __init__(self, factories: Mapping[str, Factory], scenario: Scenario) -> None:
         self._factories = factories
@@ -51,9 +43,6 @@ class Parts:
             "observer": scenario.control_period_s,
         }
         self._made: dict[str, list[Any]] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._factories)
 
     def reset(self, a: Arrays, s: Settings) -> None:
         """Make all parts anew and start them; observers run ahead by the preview."""
@@ -79,7 +68,7 @@ class Parts:
         for r, loop in enumerate(self._of("wheel_loop")):
             if a.kinds[r, 0] == TORQUE:
                 continue
-            _, hold = drivers.delays_of(a, r, s.dt)
+            _, hold = drivers.delays_of(a, 0, r, s.dt)
             wanted = (a.wanted_before if k < hold else a.wanted)[:, r, 0].copy()
             measured = a.sensors[SPEEDS, r, 0]
             torques = finite(
@@ -100,7 +89,7 @@ class Parts:
             self._observe_one(a, s, r, int(a.clock[0, 1]) + s.lookahead)
 
     def _observe_one(self, a: Arrays, s: Settings, r: int, m: int) -> None:
-        message = drivers.delayed_message_of(a, r, m, s)
+        message = drivers.delayed_message_of(a, 0, r, m, s)
         reference = self._made["observer"][r].update(message, m * s.period)
         row = finite(reference, 5, f"robot_{r}: the observer's update()")
         a.references[:, m % a.references.shape[1], r, 0] = row

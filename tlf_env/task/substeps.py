@@ -81,6 +81,7 @@ from tlf_env.task.channels import (
     SUBSTEP_CHANNELS,
 )
 from tlf_env.task.disturbance import Effects, wheel_factors
+from tlf_env.task.outlines import mark_touched
 from tlf_env.task.settings import EKF, EKF_SLIP, TRUTH, Settings
 from tlf_env.task.signals import SignalRow, signal_value
 
@@ -249,10 +250,9 @@ def delays(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
 @block
 def evaluate(a: Arrays, lane: int, r: int, first: int, last: int, tick: int, s: Settings) -> None:
     """Evaluate the channels from ``first`` to before ``last`` for one robot at a tick."""
+    signals = a.signals[a.variants[lane]]
     for c in range(first, last):
-        row = SignalRow(
-            a.signals[c, 0], a.signals[c, 1], a.signals[c, 2], a.signals[c, 3], a.signals[c, 4]
-        )
+        row = SignalRow(signals[c, 0], signals[c, 1], signals[c, 2], signals[c, 3], signals[c, 4])
         value, a.processes[c, r, lane] = signal_value(
             row,
             tick,
@@ -271,10 +271,11 @@ def evaluate(a: Arrays, lane: int, r: int, first: int, last: int, tick: int, s: 
 
 
 @block
-def advance(a: Arrays, lane: int, s: Settings) -> None:
-    """Run the substeps of a control step of every robot of a lane, each by itself."""
-    substeps, dt = s.substeps, s.dt
-    seed, episode, first = a.seeds[lane], a.clock[lane, 2], a.clock[lane, 0]
+def advance(a: Arrays, lane: int, begin: int, end: int, s: Settings) -> None:
+    """Run the substeps ``begin`` to before ``end`` of every robot of a lane, each by itself."""
+    dt = s.dt
+    seed, episode, first = a.seeds[lane], a.clock[lane, 2], a.clock[lane, 0] - begin
+    patches = a.patches[a.variants[lane]]
     for r in range(a.motions.shape[1]):
         body = read_body(a.bodies, r, lane)
         loop = read_wheel_loop(a.wheel_loops, r, lane)
@@ -291,13 +292,13 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
         kind = a.kinds[r, lane]
         wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
         dead, hold = delays(a, lane, r, dt)
+        if begin < hold:
+            wanted_l, wanted_r = a.wanted_before[0, r, lane], a.wanted_before[1, r, lane]
         delayed = a.torques[:, :, r, lane]
-        for k in range(substeps):
+        for k in range(begin, end):
             if s.changing:
                 evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, first + k, s)
                 effects = read_effects(a.applied, r, lane)
-            if k == 0 and hold > 0:
-                wanted_l, wanted_r = a.wanted_before[0, r, lane], a.wanted_before[1, r, lane]
             if k == hold:
                 wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
             motion, contact, held, trace = actuate_robot(
@@ -312,7 +313,7 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
                 kind,
                 wanted_l,
                 wanted_r,
-                a.patches,
+                patches,
                 delayed,
                 dead,
                 first + k + 1,
@@ -344,4 +345,18 @@ def advance(a: Arrays, lane: int, s: Settings) -> None:
         write_estimate(a.estimates, r, lane, estimate)
         write_slip_estimate(a.slip_estimates, r, lane, slip)
         write_trace(a.traces, r, lane, trace)
-    a.clock[lane, 0] = first + substeps
+    a.clock[lane, 0] = first + end
+
+
+@block
+def move_lane(a: Arrays, lane: int, near: bool, s: Settings) -> None:
+    """Run the substeps of a control step of a lane without contact: robots pass through each other.
+
+    While they are ``near``, each substep asks which outlines meet, so that the first touch is marked
+    where a plant with contact marks it.
+    """
+    at_once = 1 if near else s.substeps
+    for begin in range(0, s.substeps, at_once):
+        advance(a, lane, begin, begin + at_once, s)
+        if near or s.kinematic:
+            mark_touched(a, lane)
