@@ -181,7 +181,7 @@ def test_seeds_may_be_any_and_a_run_without_one_draws_its_own():
 
 @pytest.mark.parametrize("end_on", [("lost", "touched"), ("lost",), ()])
 def test_ends_are_those_of_the_environment(end_on):
-    options = {**SHORT, **CROWDED, "end_on": end_on, "lost_beyond_mm": 100.0, "plant": "batch"}
+    options = {**SHORT, **CROWDED, "end_on": end_on, "lost_beyond_mm": 260.0, "plant": "batch"}
     plant = BatchPlant("infinity", 6, **options)
     plant.reset(0)
     env = tlf_env.parallel_env("infinity", **options)
@@ -279,7 +279,10 @@ def test_episodes_draw_their_scenario_from_a_mixture():
         ({"robots": 4}, "robots is 4"),
         ({"action": "residual"}, "action is 'residual'"),
         ({"horizon_s": 2.0}, "horizon_s is 2.0"),
-        ({"trajectory": {"type": "circle", "radius_mm": 900.0}}, "trajectory is"),
+        (
+            {"trajectory": {"type": "circle", "radius_mm": 900.0, "speed_mm_s": 200.0}},
+            "trajectory is",
+        ),
     ],
 )
 def test_scenarios_that_differ_elsewhere_are_refused(change, said):
