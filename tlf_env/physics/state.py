@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.trig import sincos
 from tlf_env.physics.parameters import Body
 
 
@@ -111,4 +111,5 @@ def advance_pose(motion: Motion, dt: float) -> Motion:
 @law
 def axle_midpoint(motion: Motion, d: float) -> tuple[float, float]:
     """Position of c, mm: the centre of mass lies ``d`` behind it."""
-    return motion.x - d * math.sin(motion.theta), motion.y + d * math.cos(motion.theta)
+    sin, cos = sincos(motion.theta)
+    return motion.x - d * sin, motion.y + d * cos

@@ -12,15 +12,9 @@ import numpy as np
 
 from tlf_env.numerics.compiled import block, driver, law
 from tlf_env.numerics.philox import normal_pair
-from tlf_env.onboard.estimator import read_ekf, read_estimate, write_estimate
-from tlf_env.onboard.wheel_loop import read_loop_state, read_wheel_loop, write_loop_state
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
 from tlf_env.physics.state import (
     read_body,
-    read_contact,
-    read_motion,
-    write_contact,
-    write_motion,
 )
 from tlf_env.task.actions import (
     FULL_RESIDUAL_MM_S,
@@ -38,12 +32,6 @@ from tlf_env.task.actions import (
 )
 from tlf_env.task.arrays import (
     Arrays,
-    read_effects,
-    read_sensors,
-    read_trace,
-    write_sample,
-    write_sensors,
-    write_trace,
 )
 from tlf_env.task.channels import STEP_CHANNELS, SUBSTEP_CHANNELS
 from tlf_env.task.judging import (
@@ -56,14 +44,8 @@ from tlf_env.task.judging import (
 from tlf_env.task.outlines import mark_touched, room_to_move
 from tlf_env.task.radio import broadcast, message_slot, next_reference
 from tlf_env.task.settings import Settings
-from tlf_env.task.substeps import (
-    EXTERNAL_TORQUE,
-    actuate_robot,
-    advance,
-    delays,
-    evaluate,
-    sense_robot,
-)
+from tlf_env.task.substeps import delays, evaluate
+from tlf_env.task.tiles import actuate_lane, advance, sense_lane
 
 DONE, MUST_COLLIDE = -1, -2
 
@@ -158,67 +140,13 @@ def conclude_lane(a: Arrays, lane: int, s: Settings) -> None:
 @driver
 def actuate(a: Arrays, k: int, s: Settings) -> None:
     """The first half of substep ``k`` of lane 0: everything up to the plant's new velocities and poses."""
-    tick = a.clock[0, 0]
-    for r in range(a.motions.shape[1]):
-        kind = a.kinds[r, 0]
-        if s.external_wheel_loop and kind != TORQUE:
-            kind = EXTERNAL_TORQUE
-        if s.changing:
-            evaluate(a, 0, r, 0, SUBSTEP_CHANNELS, tick, s)
-        dead, hold = delays(a, 0, r, s.dt)
-        wanted_l, wanted_r = a.commands[0, r, 0], a.commands[1, r, 0]
-        if k < hold and kind != EXTERNAL_TORQUE:
-            wanted_l, wanted_r = a.wanted_before[0, r, 0], a.wanted_before[1, r, 0]
-        motion, contact, held, trace = actuate_robot(
-            read_body(a.bodies, r, 0),
-            read_wheel_loop(a.wheel_loops, r, 0),
-            read_effects(a.applied, r, 0),
-            read_motion(a.motions, r, 0),
-            read_contact(a.contacts, r, 0),
-            read_loop_state(a.loop_states, r, 0),
-            read_sensors(a.sensors, r, 0),
-            read_trace(a.traces, r, 0),
-            kind,
-            wanted_l,
-            wanted_r,
-            a.patches,
-            a.torques[:, :, r, 0],
-            dead,
-            tick + 1,
-            s.kinematic,
-            s.dt,
-        )
-        write_motion(a.motions, r, 0, motion)
-        write_contact(a.contacts, r, 0, contact)
-        write_loop_state(a.loop_states, r, 0, held)
-        write_trace(a.traces, r, 0, trace)
+    actuate_lane(a, 0, k, s)
 
 
 @driver
 def sense(a: Arrays, k: int, s: Settings) -> None:
     """The second half of substep ``k`` of lane 0: sensors and estimator, and which outlines meet."""
-    tick = a.clock[0, 0] + 1
-    for r in range(a.motions.shape[1]):
-        sensors, estimate, trace, sample = sense_robot(
-            read_body(a.bodies, r, 0),
-            read_ekf(a.ekfs, r, 0),
-            read_effects(a.applied, r, 0),
-            read_motion(a.motions, r, 0),
-            read_sensors(a.sensors, r, 0),
-            read_estimate(a.estimates, r, 0),
-            read_trace(a.traces, r, 0),
-            a.seeds[0],
-            a.clock[0, 2],
-            r,
-            tick,
-            s.estimator,
-            s.dt,
-        )
-        write_sample(a.samples[k], r, 0, sample)
-        write_sensors(a.sensors, r, 0, sensors)
-        write_estimate(a.estimates, r, 0, estimate)
-        write_trace(a.traces, r, 0, trace)
-    a.clock[0, 0] = tick
+    sense_lane(a, 0, k, s)
     mark_touched(a, 0)
 
 
@@ -304,7 +232,7 @@ def control_step(a: Arrays, s: Settings) -> int:
         return bad
     if not s.kinematic and not room_to_move(a, 0, s.period):
         return MUST_COLLIDE
-    advance(a, 0, s)
+    advance(a, 0, 1, s)
     if s.kinematic:
         mark_touched(a, 0)
     conclude_lane(a, 0, s)
