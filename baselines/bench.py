@@ -24,9 +24,9 @@ from typing import Any, NamedTuple
 
 from baselines.policies import make_policy
 from baselines.run import Policy, run_policy, versions
-from tlf_env.envs.parallel import checked_seed
 from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.files import atomic
+from tlf_env.numerics.philox import checked_seed
 from tlf_env.task.scenario import Scenario, load_scenario, preset_names, presets_folder
 
 RUNS, PLAN = "runs.jsonl", "plan.json"

@@ -12,8 +12,8 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from tlf_env.envs.parallel import checked_seed
 from tlf_env.numerics.files import atomic
+from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import Factory
 from tlf_env.physics.state import Motion
 from tlf_env.task.arrays import Arrays, Info

@@ -12,10 +12,10 @@ import yaml
 from baselines import ReferencePolicy
 from tlf_env.envs.parallel import parallel_env
 from tlf_env.onboard.parts import part_name
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.parameters import RobotParameters, body, laden
 from tlf_env.task.arrays import Info, Sample
 from tlf_env.task.channels import CHANNELS, NOMINAL_NOISE_MM, PATHS, STEP_CHANNELS, number
-from tlf_env.task.disturbance import Disturbance, loaded
+from tlf_env.task.disturbance import Disturbance
 from tlf_env.task.formation import Formation
 from tlf_env.task.radio import message_slot
 from tlf_env.task.scenario import load_scenario, preset_names, presets_folder
@@ -612,30 +612,34 @@ def test_a_users_observer_hears_through_the_same_radio(channel):
 def test_a_payload_moves_mass_inertia_and_loads_by_the_parallel_axis_theorem(
     mass_kg, behind_mm, inertia_kg_mm2
 ):
-    robot = loaded(ROBOT, mass_kg, behind_mm, inertia_kg_mm2)
+    robot = laden(body(ROBOT), mass_kg, behind_mm, inertia_kg_mm2)
     both = [(ROBOT.mass_kg, ROBOT.com_offset_mm), (mass_kg, behind_mm)]
-    assert robot.mass_kg == sum(m for m, _ in both)
+    assert robot.m == sum(m for m, _ in both)
     # the same about the axle's midpoint, where it does not matter where the common centre lies
     about_c = ROBOT.body_inertia_kg_mm2 + inertia_kg_mm2 + sum(m * x**2 for m, x in both)
-    found_c = robot.body_inertia_kg_mm2 + robot.mass_kg * robot.com_offset_mm**2
-    assert found_c == pytest.approx(about_c, rel=1e-12)
-    assert robot.mass_kg * robot.com_offset_mm == pytest.approx(sum(m * x for m, x in both))
+    assert robot.I + robot.m * robot.d**2 == pytest.approx(about_c, rel=1e-12)
+    assert robot.m * robot.d == pytest.approx(sum(m * x for m, x in both))
     # forces and moments about the axle
     base = ROBOT.castor_pivot_mm + ROBOT.castor_trail_mm
-    castor = sum(m * x for m, x in both) / base
-    assert robot.castor_load_share * robot.mass_kg == pytest.approx(castor)
-    assert 2 * robot.drive_load_share + robot.castor_load_share == pytest.approx(1)
-    same = robot.model_copy(update={name: getattr(ROBOT, name) for name in CHANGED_BY_PAYLOAD})
-    assert same == ROBOT
+    castor = sum(m * x for m, x in both) * ROBOT.gravity_mm_s2 / base
+    assert robot.load_castor == pytest.approx(castor)
+    weight = robot.m * ROBOT.gravity_mm_s2
+    assert 2 * robot.load_drive + robot.load_castor == pytest.approx(weight)
 
 
-CHANGED_BY_PAYLOAD = (
-    "mass_kg",
-    "com_offset_mm",
-    "body_inertia_kg_mm2",
-    "castor_load_share",
-    "drive_load_share",
-)
+@pytest.mark.parametrize(("mass_kg", "behind_mm"), [(0.5, 60.0), (1.7, 33.3)])
+def test_a_payload_leaves_the_constants_of_a_robot_of_that_weight(mass_kg, behind_mm):
+    found = laden(body(ROBOT), mass_kg, behind_mm, 800.0)
+    share = found.d / (ROBOT.castor_pivot_mm + ROBOT.castor_trail_mm)
+    changed = {
+        "mass_kg": found.m,
+        "com_offset_mm": found.d,
+        "body_inertia_kg_mm2": found.I,
+        "castor_load_share": share,
+        "drive_load_share": (1 - share) / 2,
+    }
+    same = body(RobotParameters(**(ROBOT.model_dump() | changed)))
+    assert same == body(ROBOT)._replace(**found._asdict())
 
 
 def test_a_payload_slows_the_robot_as_newton_says():
@@ -700,13 +704,10 @@ def test_start_outlines_never_overlap_though_unchecked_draws_would():
     assert (outline_gaps(free).min(axis=0) < 0).mean() > 0.05
 
 
-def test_a_scatter_without_room_is_refused_and_given_poses_are_taken_as_they_are(monkeypatch):
+def test_a_scatter_without_room_is_refused_and_given_poses_are_taken_as_they_are():
     formation = make()
-    with monkeypatch.context() as patch:
-        patch.setattr("tlf_env.task.formation._apart", lambda *_: False)
-        patch.setattr("tlf_env.task.formation.START_ATTEMPTS", 3)
-        with pytest.raises(ValueError, match=r"robot_\d+: no start pose without overlap"):
-            make({"start": {"position_std_mm": 0.001}})
+    with pytest.raises(ValueError, match=r"robot_1: no start pose without overlap"):
+        make({"start": {"heading_std_rad": 1e-15}}, start_spacing_mm=221.0)
     poses = formation.arrays.starts[:, :, 0].T + np.array([10.0, 20.0, 0.1])
     formation = make("start")
     formation.reset(0, poses=poses)

@@ -94,7 +94,7 @@ def run(
     """Drive a policy through a scenario to the horizon; a table, a summary, data and figures."""
     from baselines.policies import make_policy
     from baselines.run import run_policy, summary, write_mat, write_record
-    from tlf_env.envs.parallel import checked_seed
+    from tlf_env.numerics.philox import checked_seed
     from tlf_env.task.scenario import load_scenario, scenario_warnings
 
     chosen = load_scenario(

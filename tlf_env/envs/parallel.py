@@ -16,10 +16,10 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from tlf_env.envs.spec import documented
-from tlf_env.numerics.philox import MAX_SEED
+from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import Factory, part_name
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.arrays import Info, State
+from tlf_env.task.arrays import END_REASONS, Info, State
 from tlf_env.task.channels import PATHS
 from tlf_env.task.formation import STATE_SCALES, Formation
 from tlf_env.task.observation import OBSERVATION_LIMIT
@@ -234,20 +234,11 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         raise ValueError(f"{what}; the agents are {', '.join(self.agents)}")
 
     def _ends(self) -> tuple[dict[Agent, bool], dict[Agent, bool], dict[Agent, str]]:
-        a, s = self._formation.arrays, self.scenario
-        ends: dict[Agent, str] = {}
-        if "lost" in s.end_on and a.lost_now.any():
-            ends = {self.agents[r]: "lost" for r in np.flatnonzero(a.lost_now[0])}
-        if "touched" in s.end_on and a.touched_now.any():
-            ends |= {self.agents[r]: "touched" for r in np.flatnonzero(a.touched_now[0])}
-        terminated = {agent: agent in ends for agent in self.agents}
-        rest = "horizon" if self._formation.step_count >= s.horizon_steps else None
-        if ends:
-            rest = "other_robot"
-        truncated = {agent: rest is not None and agent not in ends for agent in self.agents}
-        if rest is not None:
-            ends = {agent: ends.get(agent, rest) for agent in self.agents}
-        return terminated, truncated, ends
+        a = self._formation.arrays
+        terminated = dict(zip(self.agents, a.terminated[0].tolist(), strict=True))
+        truncated = dict(zip(self.agents, a.truncated[0].tolist(), strict=True))
+        reasons = zip(self.agents, a.ends[0].tolist(), strict=True)
+        return terminated, truncated, {agent: END_REASONS[end] for agent, end in reasons if end}
 
     def _seen(self) -> np.ndarray:
         a = self._formation.arrays
@@ -359,23 +350,6 @@ def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | No
             f"got the shape {poses.shape}: {options['poses']!r}"
         )
     return poses, float(phase_s)
-
-
-def checked_seed(seed: int) -> int:
-    """A seed as a plain int.
-
-    Raises
-    ------
-    ValueError
-        if it is no whole number from 0 to 2⁶³ − 1.
-    """
-    if (
-        isinstance(seed, bool)
-        or not isinstance(seed, int | np.integer)
-        or not 0 <= seed <= MAX_SEED
-    ):
-        raise ValueError(f"seed {seed!r} must be a whole number from 0 to {MAX_SEED}")
-    return int(seed)
 
 
 def parallel_env(

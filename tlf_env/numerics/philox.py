@@ -95,3 +95,20 @@ def normal_pair(
     radius = math.sqrt(-2.0 * log(1.0 - unit(w_0)))
     sin, cos = sincos(2.0 * math.pi * unit(w_1))
     return radius * cos, radius * sin
+
+
+def checked_seed(seed: int) -> int:
+    """A seed as a plain int.
+
+    Raises
+    ------
+    ValueError
+        if it is no whole number from 0 to 2⁶³ − 1.
+    """
+    if (
+        isinstance(seed, bool)
+        or not isinstance(seed, int | np.integer)
+        or not 0 <= seed <= MAX_SEED
+    ):
+        raise ValueError(f"seed {seed!r} must be a whole number from 0 to {MAX_SEED}")
+    return int(seed)

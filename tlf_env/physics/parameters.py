@@ -10,6 +10,8 @@ from typing import Annotated, NamedTuple, Self
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, FiniteFloat, model_validator
 
+from tlf_env.numerics.compiled import law
+
 Positive = Annotated[FiniteFloat, Field(gt=0)]
 NonNegative = Annotated[FiniteFloat, Field(ge=0)]
 
@@ -153,6 +155,24 @@ class Joint(NamedTuple):
     preload: float
 
 
+class Mass(NamedTuple):
+    """What a payload changes of a :class:`Body`: its first fields, in the same order."""
+
+    m: float
+    I: float  # noqa: E741  the symbol of the equations
+    d: float
+    q: float
+    load_drive: float
+    load_castor: float
+    w_ee: float
+    w_ff: float
+    w_ef: float
+    I_rolling: float  # about c, with the drive wheels' spins: I + m d² + 2 J h²/R²
+    inverse_m: float
+    inverse_I: float
+    outline_ahead: float  # centre of the outline ahead of the centre of mass
+
+
 class Body(NamedTuple):
     """One robot as the kernel reads it: mN, mm, kg, s; inverse masses computed once.
 
@@ -160,35 +180,40 @@ class Body(NamedTuple):
     the centre of mass, T trail, subscripts e right, f forward.
     """
 
+    # the fields of Mass
     m: float
     I: float  # noqa: E741  the symbol of the equations
+    d: float
+    q: float
+    load_drive: float
+    load_castor: float
+    w_ee: float
+    w_ff: float
+    w_ef: float
+    I_rolling: float
+    inverse_m: float
+    inverse_I: float
+    outline_ahead: float
+    # what no payload changes
     I_s: float
     J: float
     J_c: float
     R: float
     R_c: float
     h: float
-    d: float
-    q: float
     T: float
-    load_drive: float
-    load_castor: float
-    w_ee: float
-    w_ff: float
-    w_ef: float
     spin_drive: float  # R²/J
     spin_castor: float  # R_c²/J_c
     spin_mass_drive: float  # J/R²
     spin_mass_castor: float  # J_c/R_c²
-    I_rolling: float  # about c, with the drive wheels' spins: I + m d² + 2 J h²/R²
-    inverse_m: float
-    inverse_I: float
     inverse_I_s: float
     inverse_J: float
     inverse_J_c: float
     torque_limit: float
     outline_radius: float
-    outline_ahead: float  # centre of the outline ahead of the centre of mass
+    gravity: float
+    pivot: float  # castor's pivot behind c
+    outline_behind: float  # centre of the outline behind c
     # tyre
     mu_static: float
     mu_dynamic: float
@@ -236,42 +261,103 @@ def _joint_row(joint: JointFriction, *, enabled: bool) -> Joint:
     )
 
 
+def weighed(
+    m: float,
+    I: float,  # noqa: E741
+    d: float,
+    drive_share: float,
+    castor_share: float,
+    gravity: float,
+    pivot: float,
+    h: float,
+    spin_mass: float,
+    outline_behind: float,
+) -> Mass:
+    """What follows from mass, inertia, centre of mass and each wheel's share of the weight."""
+    weight = m * gravity
+    inverse_m, inverse_I = 1.0 / m, 1.0 / I
+    return Mass(
+        m,
+        I,
+        d,
+        pivot - d,
+        drive_share * weight,
+        castor_share * weight,
+        inverse_m + d * d * inverse_I,
+        inverse_m + h * h * inverse_I,
+        d * h * inverse_I,
+        I + m * (d * d) + 2.0 * spin_mass * (h * h),
+        inverse_m,
+        inverse_I,
+        d - outline_behind,
+    )
+
+
+compiled_weighed = law(weighed)
+
+
+@law
+def laden(empty: Body, mass: float, behind: float, inertia: float) -> Mass:
+    """The robot with a payload (kg, mm behind c, kg·mm² about its own centre).
+
+    The wheels can carry it while the common centre of mass, ``d``, lies above their base:
+    from 0 to ``pivot + T``.
+    """
+    m = empty.m + mass
+    d = (empty.m * empty.d + mass * behind) / m
+    own, other = d - empty.d, behind - d
+    castor_share = d / (empty.pivot + empty.T)
+    return compiled_weighed(
+        m,
+        empty.I + empty.m * (own * own) + inertia + mass * (other * other),
+        d,
+        (1.0 - castor_share) / 2.0,
+        castor_share,
+        empty.gravity,
+        empty.pivot,
+        empty.h,
+        empty.spin_mass_drive,
+        empty.outline_behind,
+    )
+
+
 def body(p: RobotParameters) -> Body:
     """Kernel constants of one robot."""
     half_mm = p.axle_width_mm / 2
-    weight_mN = p.mass_kg * p.gravity_mm_s2
     spin_mass = p.wheel_inertia_kg_mm2 / p.wheel_radius_mm**2
-    inverse_m, inverse_I = 1 / p.mass_kg, 1 / p.body_inertia_kg_mm2
-    return Body(
+    mass = weighed(
         p.mass_kg,
         p.body_inertia_kg_mm2,
+        p.com_offset_mm,
+        p.drive_load_share,
+        p.castor_load_share,
+        p.gravity_mm_s2,
+        p.castor_pivot_mm,
+        half_mm,
+        spin_mass,
+        p.outline_offset_mm,
+    )
+    return Body(
+        *mass,
         p.fork_inertia_kg_mm2,
         p.wheel_inertia_kg_mm2,
         p.castor_inertia_kg_mm2,
         p.wheel_radius_mm,
         p.castor_radius_mm,
         half_mm,
-        p.com_offset_mm,
-        p.castor_pivot_mm - p.com_offset_mm,
         p.castor_trail_mm,
-        p.drive_load_share * weight_mN,
-        p.castor_load_share * weight_mN,
-        inverse_m + p.com_offset_mm**2 * inverse_I,
-        inverse_m + half_mm**2 * inverse_I,
-        p.com_offset_mm * half_mm * inverse_I,
         p.wheel_radius_mm**2 / p.wheel_inertia_kg_mm2,
         p.castor_radius_mm**2 / p.castor_inertia_kg_mm2,
         spin_mass,
         p.castor_inertia_kg_mm2 / p.castor_radius_mm**2,
-        p.body_inertia_kg_mm2 + p.mass_kg * p.com_offset_mm**2 + 2 * spin_mass * half_mm**2,
-        inverse_m,
-        inverse_I,
         1 / p.fork_inertia_kg_mm2,
         1 / p.wheel_inertia_kg_mm2,
         1 / p.castor_inertia_kg_mm2,
         p.torque_limit_Nmm * MILLINEWTON_PER_NEWTON,
         p.outline_radius_mm,
-        p.com_offset_mm - p.outline_offset_mm,
+        p.gravity_mm_s2,
+        p.castor_pivot_mm,
+        p.outline_offset_mm,
         p.tyre.mu_static,
         p.tyre.mu_dynamic,
         p.tyre.stiction_speed_mm_s,

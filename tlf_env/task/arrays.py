@@ -3,19 +3,25 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from tlf_env.numerics.compiled import reader, writer
-from tlf_env.onboard.estimator import Estimate, ekf_constants
+from tlf_env.onboard.estimator import Ekf, Estimate, ekf_constants
 from tlf_env.onboard.observer import Message, Reference
-from tlf_env.onboard.wheel_loop import WheelLoopParameters, WheelLoopState, digital_wheel_loop
-from tlf_env.physics.parameters import body_array
+from tlf_env.onboard.wheel_loop import (
+    WheelLoop,
+    WheelLoopParameters,
+    WheelLoopState,
+    digital_wheel_loop,
+)
+from tlf_env.physics.parameters import Body, body_array
 from tlf_env.physics.state import Contact, Motion
 from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
 from tlf_env.task.channels import CHANNELS, DEAD_TIME, JITTER
-from tlf_env.task.disturbance import Effects, leveled, patch_rows, signal_rows
+from tlf_env.task.disturbance import Effects, PatchRow, leveled, patch_rows, signal_rows
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.reward import RewardTerms
@@ -81,6 +87,9 @@ class Info(NamedTuple):
     clipped: float
 
 
+RUNNING, LOST, TOUCHED, OTHER_ROBOT, HORIZON = range(5)
+END_REASONS = ("", "lost", "touched", "other_robot", "horizon")
+
 INFO_MEANINGS = {
     "position_error_mm": "true position of c to the robot's own reference (leader: the path)",
     "formation_error_mm": "true position to ref(t − i·gap), at rest at ref(0) before",
@@ -130,16 +139,28 @@ class State(NamedTuple):
 
 
 class Arrays(NamedTuple):
-    """``(field, robot, lane)`` unless said; a lane is one formation."""
+    """``(field, robot, lane)`` unless said; a lane is one formation.
 
+    Lanes may run different scenarios, their *variants*.
+    """
+
+    # constants of the variants
+    empty_bodies: np.ndarray  # (field, robot, variant): without payload
+    variant_loops: np.ndarray  # (field, robot, variant)
+    variant_ekfs: np.ndarray  # (field, robot, variant)
+    variant_levels: np.ndarray  # (variant,)
+    signals: np.ndarray  # (variant, channel, SignalRow)
+    patches: np.ndarray  # (variant, patch, PatchRow)
+    mixture: (
+        np.ndarray
+    )  # (variant,): summed shares of the variants if episodes draw theirs, else empty
+    table: np.ndarray  # (step, Reference): the leader's reference at the control steps
     # constants of an episode
+    variants: np.ndarray  # (lane,) int64
     bodies: np.ndarray
     wheel_loops: np.ndarray
     ekfs: np.ndarray
     levels: np.ndarray  # (lane,) of the disturbance
-    signals: np.ndarray  # (channel, SignalRow)
-    patches: np.ndarray  # (patch, PatchRow)
-    table: np.ndarray  # (step, Reference): the leader's reference at the control steps
     # physics
     motions: np.ndarray
     contacts: np.ndarray
@@ -183,6 +204,9 @@ class Arrays(NamedTuple):
     touched: np.ndarray
     lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
     touched_now: np.ndarray
+    ends: np.ndarray  # (lane, robot) int8: why the episode ended in this step, as in END_REASONS
+    terminated: np.ndarray  # (lane, robot) bool, in this step
+    truncated: np.ndarray
     scales: np.ndarray  # (entry,) of `tracking`
     sensor_scales: np.ndarray  # (entry,) of `sensor`
     weights: np.ndarray  # (RewardTerms,)
@@ -201,6 +225,23 @@ def _constant(row: tuple[float, ...], robots: int, lanes: int) -> np.ndarray:
     return np.tile(np.array(row, dtype=np.float64)[:, None, None], (1, robots, lanes))
 
 
+def _per_variant(rows: Sequence[tuple[float, ...]], robots: int) -> np.ndarray:
+    """Rows of the variants as (field, robot, variant), every robot alike."""
+    return np.ascontiguousarray(np.repeat(np.array(rows).T[:, None, :], robots, axis=1))
+
+
+NOWHERE = PatchRow(x=math.inf, y=0.0, radius=0.0, scale=1.0)
+
+
+def _all_patches(scenarios: Sequence[Scenario]) -> np.ndarray:
+    """Patches as (variant, patch, PatchRow), filled up with patches that nothing lies on."""
+    rows = [patch_rows(scenario.disturbance) for scenario in scenarios]
+    out = np.tile(np.array(NOWHERE), (len(rows), max(map(len, rows)), 1))
+    for patches, some in zip(out, rows, strict=True):
+        patches[: len(some)] = some
+    return out
+
+
 def longest(scenario: Scenario, channel: int) -> float:
     """The largest value that a channel can have; its range's end if an adversary may set it."""
     if scenario.adversary:
@@ -210,12 +251,26 @@ def longest(scenario: Scenario, channel: int) -> float:
     return max(leveled(CHANNELS[channel].nominal, end, level) for end in reach)
 
 
-def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays:
-    """Arrays of ``lanes`` formations, not yet reset."""
-    n = scenario.robot_count
+def _loop_row(scenario: Scenario) -> tuple[float, ...]:
     wheel_loop = scenario.wheel_loop
     if isinstance(wheel_loop, str):  # an object outside; the arrays' own loop rests
         wheel_loop = WheelLoopParameters()
+    return digital_wheel_loop(wheel_loop, scenario.physics_period_s)
+
+
+def make_arrays(
+    scenarios: Sequence[Scenario],
+    table: np.ndarray,
+    lanes: int = 1,
+    mixture: Sequence[float] = (),
+) -> Arrays:
+    """Arrays of ``lanes`` formations, not yet reset; lane k runs variant k modulo their number.
+
+    The scenarios may differ in their robots' parameters, wheel loops, filters and disturbances only.
+    With the shares ``mixture`` of the variants, which sum to 1, every episode draws its own.
+    """
+    scenario = scenarios[0]
+    n = scenario.robot_count
     dtype = np.dtype(scenario.dtype)
     sensor = len(sensor_entries(scenario.substeps)) if scenario.observation == "sensor" else 0
     gap = scenario.gap_steps
@@ -223,23 +278,34 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
     lookahead = max(scenario.preview_steps, default=0)
     entries = len(tracking_entries(scenario.preview_s))
 
-    dead = round(longest(scenario, DEAD_TIME) / scenario.physics_period_s)
-    late = math.ceil(longest(scenario, JITTER) / scenario.control_period_s)
+    dead = max(round(longest(one, DEAD_TIME) / one.physics_period_s) for one in scenarios)
+    late = max(math.ceil(longest(one, JITTER) / one.control_period_s) for one in scenarios)
     ring = gap + 1 + late
 
     def zeros(fields: int) -> np.ndarray:
         return np.zeros((fields, n, lanes))
 
     return Arrays(
-        bodies=body_array(list(scenario.robot_models), lanes),
-        wheel_loops=_constant(digital_wheel_loop(wheel_loop, scenario.physics_period_s), n, lanes),
-        ekfs=_constant(ekf_constants(scenario.ekf), n, lanes),
-        levels=np.full(lanes, scenario.disturbance.level),
-        signals=signal_rows(
-            scenario.disturbance, scenario.physics_period_s, scenario.control_period_s
+        empty_bodies=np.concatenate(
+            [body_array(list(one.robot_models)) for one in scenarios], axis=2
         ),
-        patches=patch_rows(scenario.disturbance),
+        variant_loops=_per_variant([_loop_row(one) for one in scenarios], n),
+        variant_ekfs=_per_variant([ekf_constants(one.ekf) for one in scenarios], n),
+        variant_levels=np.array([one.disturbance.level for one in scenarios]),
+        signals=np.array(
+            [
+                signal_rows(one.disturbance, one.physics_period_s, one.control_period_s)
+                for one in scenarios
+            ]
+        ),
+        patches=_all_patches(scenarios),
+        mixture=np.cumsum(np.array(mixture, dtype=np.float64)),
         table=table.copy(),
+        variants=np.arange(lanes) % len(scenarios),
+        bodies=zeros(len(Body._fields)),
+        wheel_loops=zeros(len(WheelLoop._fields)),
+        ekfs=zeros(len(Ekf._fields)),
+        levels=np.zeros(lanes),
         motions=zeros(len(Motion._fields)),
         contacts=zeros(len(Contact._fields)),
         processes=zeros(len(CHANNELS)),
@@ -275,6 +341,9 @@ def make_arrays(scenario: Scenario, table: np.ndarray, lanes: int = 1) -> Arrays
         touched=np.zeros((lanes, n), dtype=np.bool_),
         lost_now=np.zeros((lanes, n), dtype=np.bool_),
         touched_now=np.zeros((lanes, n), dtype=np.bool_),
+        ends=np.zeros((lanes, n), dtype=np.int8),
+        terminated=np.zeros((lanes, n), dtype=np.bool_),
+        truncated=np.zeros((lanes, n), dtype=np.bool_),
         scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
         sensor_scales=np.array(
             [entry.scale for entry in sensor_entries(scenario.substeps).values()]

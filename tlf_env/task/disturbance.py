@@ -13,7 +13,7 @@ import numpy as np
 from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
 
 from tlf_env.numerics.compiled import law, reader
-from tlf_env.physics.parameters import Body, Frozen, NonNegative, Positive, RobotParameters, body
+from tlf_env.physics.parameters import Body, Frozen, NonNegative, Positive
 from tlf_env.physics.state import Motion
 from tlf_env.task.channels import CHANNELS, PATHS, SUBSTEP_CHANNELS
 from tlf_env.task.signals import Constant, Signal
@@ -221,45 +221,3 @@ def wheel_factors(patches: np.ndarray, robot: Body, motion: Motion) -> tuple[flo
         patch_factor(patches, c_x + robot.h * cos, c_y + robot.h * sin),
         patch_factor(patches, castor_x, castor_y),
     )
-
-
-def loaded(
-    robot: RobotParameters, mass_kg: float, behind_mm: float, inertia_kg_mm2: float
-) -> RobotParameters:
-    """The robot with a payload: mass, centre of mass, inertia and the wheels' loads follow from it.
-
-    Raises
-    ------
-    ValueError
-        if the common centre of mass leaves the wheels' base.
-    """
-    total = robot.mass_kg + mass_kg
-    d_mm = (robot.mass_kg * robot.com_offset_mm + mass_kg * behind_mm) / total
-    base_mm = robot.castor_pivot_mm + robot.castor_trail_mm
-    if not 0 <= d_mm < base_mm:
-        raise ValueError(
-            f"payload of {mass_kg:g} kg at {behind_mm:g} mm puts the centre of mass {d_mm:g} mm behind "
-            f"the axle; the wheels carry it from 0 to {base_mm:g} mm"
-        )
-    inertia = (
-        robot.body_inertia_kg_mm2
-        + robot.mass_kg * (d_mm - robot.com_offset_mm) ** 2
-        + inertia_kg_mm2
-        + mass_kg * (behind_mm - d_mm) ** 2
-    )
-    castor_share = d_mm / base_mm
-    return RobotParameters.model_validate(
-        robot.model_dump()
-        | {
-            "mass_kg": total,
-            "com_offset_mm": d_mm,
-            "body_inertia_kg_mm2": inertia,
-            "castor_load_share": castor_share,
-            "drive_load_share": (1 - castor_share) / 2,
-        }
-    )
-
-
-def loaded_body(robot: RobotParameters, values: np.ndarray) -> Body:
-    """Kernel constants of a robot with the payload ``(mass, behind, inertia)``."""
-    return body(loaded(robot, *values.tolist()))

@@ -11,11 +11,8 @@ from __future__ import annotations
 import numpy as np
 
 from tlf_env.numerics.compiled import block, driver, law
-from tlf_env.numerics.philox import normal_pair
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
-from tlf_env.physics.state import (
-    read_body,
-)
+from tlf_env.physics.state import read_body
 from tlf_env.task.actions import (
     FULL_RESIDUAL_MM_S,
     FULL_RESIDUAL_RAD_S,
@@ -31,11 +28,13 @@ from tlf_env.task.actions import (
     wheel_command,
 )
 from tlf_env.task.arrays import (
+    RUNNING,
     Arrays,
 )
 from tlf_env.task.channels import STEP_CHANNELS, SUBSTEP_CHANNELS
 from tlf_env.task.judging import (
     CLIPPED,
+    end_lane,
     judge_robot,
     observe_robot,
     observe_sensors,
@@ -44,10 +43,13 @@ from tlf_env.task.judging import (
 from tlf_env.task.outlines import mark_touched, room_to_move
 from tlf_env.task.radio import broadcast, message_slot, next_reference
 from tlf_env.task.settings import Settings
+from tlf_env.task.starting import STARTED, fill, start_lane
 from tlf_env.task.substeps import delays, evaluate
-from tlf_env.task.tiles import actuate_lane, advance, sense_lane
+from tlf_env.task.tiles import advance, move_lanes
 
-DONE, MUST_COLLIDE = -1, -2
+DONE, MUST_COLLIDE, MUST_SUBSTEP = -1, -2, -3
+FIRST_LANE = np.zeros(1, dtype=np.int64)
+LANES_AT_ONCE = 16  # whose arrays stay in the processor's cache during a step
 
 
 @law
@@ -69,38 +71,39 @@ def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
 
 
 @block
-def take_actions(a: Arrays, s: Settings) -> int:
-    """Clip the actions and turn them into commands; clears the traces.
-
-    Returns ``DONE``, or lane · robots + robot of the first action that is not finite; then nothing changes.
-    """
-    lanes, robots = a.actions.shape[0], a.actions.shape[1]
-    for lane in range(lanes):
+def first_bad_action(a: Arrays, first: int, last: int) -> int:
+    """``DONE``, or lane · robots + robot of the first action that is not finite."""
+    robots = a.actions.shape[1]
+    for lane in range(first, last):
         for r in range(robots):
             if not (np.isfinite(a.actions[lane, r, 0]) and np.isfinite(a.actions[lane, r, 1])):
                 return lane * robots + r
-    for lane in range(lanes):
-        for r in range(robots):
-            if a.kinds[r, lane] == REFERENCE:
-                base = a.base_actions[lane, r]
-                base[0], base[1] = reference_action(a.observations[lane, r], a.scales, s.base)
-                a.actions[lane, r, 0], a.actions[lane, r, 1] = limited(base[0]), limited(base[1])
-            a_0, a_1 = limited(a.actions[lane, r, 0]), limited(a.actions[lane, r, 1])
-            clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]
-            if clipped:
-                a.infos[lane, r, CLIPPED] += 1.0
-            a.actions[lane, r, 0], a.actions[lane, r, 1] = a_0, a_1
-            a.wanted_before[0, r, lane] = a.wanted[0, r, lane]
-            a.wanted_before[1, r, lane] = a.wanted[1, r, lane]
-            a.wanted[0, r, lane], a.wanted[1, r, lane] = command(a, lane, r, s)
-            a.commands[0, r, lane] = a.wanted[0, r, lane]
-            a.commands[1, r, lane] = a.wanted[1, r, lane]
-            evaluate(a, lane, r, SUBSTEP_CHANNELS, STEP_CHANNELS, a.clock[lane, 0], s)
-            if s.adversary and not s.changing:
-                evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, a.clock[lane, 0], s)
-            a.lost_now[lane, r] = a.touched_now[lane, r] = False
-    a.traces[:] = 0.0
     return DONE
+
+
+@block
+def take_actions(a: Arrays, lane: int, s: Settings) -> None:
+    """Clip the actions of a lane and turn them into commands; clears the traces."""
+    for r in range(a.actions.shape[1]):
+        if a.kinds[r, lane] == REFERENCE:
+            base = a.base_actions[lane, r]
+            base[0], base[1] = reference_action(a.observations[lane, r], a.scales, s.base)
+            a.actions[lane, r, 0], a.actions[lane, r, 1] = limited(base[0]), limited(base[1])
+        a_0, a_1 = limited(a.actions[lane, r, 0]), limited(a.actions[lane, r, 1])
+        clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]
+        if clipped:
+            a.infos[lane, r, CLIPPED] += 1.0
+        a.actions[lane, r, 0], a.actions[lane, r, 1] = a_0, a_1
+        a.wanted_before[0, r, lane] = a.wanted[0, r, lane]
+        a.wanted_before[1, r, lane] = a.wanted[1, r, lane]
+        a.wanted[0, r, lane], a.wanted[1, r, lane] = command(a, lane, r, s)
+        a.commands[0, r, lane] = a.wanted[0, r, lane]
+        a.commands[1, r, lane] = a.wanted[1, r, lane]
+        evaluate(a, lane, r, SUBSTEP_CHANNELS, STEP_CHANNELS, a.clock[lane, 0], s)
+        if s.adversary and not s.changing:
+            evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, a.clock[lane, 0], s)
+        a.lost_now[lane, r] = a.touched_now[lane, r] = False
+    fill(a.traces, lane, 0.0)
 
 
 @block
@@ -126,6 +129,7 @@ def look_lane(a: Arrays, lane: int, s: Settings) -> None:
     if s.cooperative:
         mean = a.rewards[lane].mean()
         a.rewards[lane, :] = mean
+    end_lane(a, lane, s)
 
 
 @block
@@ -135,19 +139,6 @@ def conclude_lane(a: Arrays, lane: int, s: Settings) -> None:
     for r in range(a.motions.shape[1]):
         next_reference(a, lane, r, a.clock[lane, 1] + s.lookahead, s)
     look_lane(a, lane, s)
-
-
-@driver
-def actuate(a: Arrays, k: int, s: Settings) -> None:
-    """The first half of substep ``k`` of lane 0: everything up to the plant's new velocities and poses."""
-    actuate_lane(a, 0, k, s)
-
-
-@driver
-def sense(a: Arrays, k: int, s: Settings) -> None:
-    """The second half of substep ``k`` of lane 0: sensors and estimator, and which outlines meet."""
-    sense_lane(a, 0, k, s)
-    mark_touched(a, 0)
 
 
 @driver
@@ -163,29 +154,30 @@ def delays_of(a: Arrays, r: int, dt: float) -> tuple[int, int]:
 
 
 @driver
-def draw_episode(a: Arrays, lane: int, s: Settings) -> None:
-    """All channels at the start of an episode; before the poses are set."""
-    for r in range(a.motions.shape[1]):
-        evaluate(a, lane, r, 0, a.signals.shape[0], 0, s)
+def start(a: Arrays, mask: np.ndarray, poses: np.ndarray, s: Settings) -> tuple[int, int, int]:
+    """:func:`start_lane` of every lane of the mask, up to the first that fails.
+
+    Returns its result and the lane. :func:`look` comes after it.
+    """
+    for lane in range(mask.shape[0]):
+        if mask[lane]:
+            result, robot = start_lane(a, lane, s, poses)
+            if result != STARTED:
+                return result, robot, lane
+    return STARTED, 0, 0
 
 
 @driver
-def draw_normals(a: Arrays, lane: int, stream: int, r: int, index: int) -> tuple[float, float]:
-    """Two standard normal numbers of a robot's stream in this episode."""
-    return normal_pair(a.seeds[lane], stream, r, a.clock[lane, 2], index)
-
-
-@driver
-def begin(a: Arrays, lane: int, s: Settings) -> None:
-    """After the poses of a lane are set: first messages, and references up to the preview."""
-    robots = a.motions.shape[1]
-    for r in range(robots):
-        broadcast(a, lane, r, 0, s.period)
-        record_truth(a, lane, r, 0)
-    for r in range(robots):
-        if r == 0 or not s.external_observer:
-            for m in range(s.lookahead + 1):
-                next_reference(a, lane, r, m, s)
+def look(a: Arrays, mask: np.ndarray, at_start: bool, s: Settings) -> None:
+    """:func:`look_lane` of the lanes of the mask; who starts lost is lost in the first step."""
+    for lane in range(mask.shape[0]):
+        if mask[lane]:
+            look_lane(a, lane, s)
+            if at_start:
+                for r in range(a.ends.shape[1]):
+                    a.lost[lane, r] = a.lost_now[lane, r] = False
+                    a.ends[lane, r] = RUNNING
+                    a.terminated[lane, r] = a.truncated[lane, r] = False
 
 
 @driver
@@ -202,38 +194,56 @@ def observe_followers(a: Arrays, s: Settings) -> None:
         next_reference(a, 0, r, a.clock[0, 1] + s.lookahead, s)
 
 
-@driver
-def look(a: Arrays, s: Settings) -> None:
-    """:func:`look_lane` of lane 0."""
-    look_lane(a, 0, s)
+@block
+def are_near(a: Arrays, lane: int, s: Settings) -> bool:
+    """Whether outlines could meet within the control step; without torques only its end counts."""
+    return not s.kinematic and not room_to_move(a, lane, s.period)
 
 
 @driver
-def prepare(a: Arrays, s: Settings) -> int:
-    """Take the actions of lane 0; returns as :func:`control_step` does, ``MUST_COLLIDE`` if near."""
-    bad = take_actions(a, s)
-    if bad != DONE:
-        return bad
-    if not s.kinematic and not room_to_move(a, 0, s.period):
-        return MUST_COLLIDE
-    return DONE
+def actuate(a: Arrays, k: int, s: Settings) -> None:
+    """The first half of substep ``k`` of lane 0: everything up to the plant's new velocities and poses."""
+    advance(a, FIRST_LANE, k, k + 1, True, False, s)
 
 
 @driver
-def control_step(a: Arrays, s: Settings) -> int:
-    """A whole control step of lane 0.
+def sense(a: Arrays, k: int, s: Settings) -> None:
+    """The second half of substep ``k`` of lane 0: sensors and estimator, and which outlines meet."""
+    advance(a, FIRST_LANE, k, k + 1, False, True, s)
+    mark_touched(a, 0)
 
-    Returns ``DONE``; or the number of the first robot whose action is not finite, and nothing has
-    changed; or ``MUST_COLLIDE``: robots are close, actions are taken, and the substeps are left to
-    the plant's space.
+
+@driver
+def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
+    """A whole control step of the lanes from ``first`` to before ``last``.
+
+    Returns ``DONE``; or the number of the first robot whose action is not finite (see
+    :func:`first_bad_action`), and nothing has changed. For a single lane also ``MUST_COLLIDE`` or
+    ``MUST_SUBSTEP``: actions are taken, and the substeps are left to the plant's space, because robots
+    are close, or to Python, because there are parts that live there.
     """
-    bad = take_actions(a, s)
+    bad = first_bad_action(a, first, last)
     if bad != DONE:
         return bad
-    if not s.kinematic and not room_to_move(a, 0, s.period):
-        return MUST_COLLIDE
-    advance(a, 0, 1, s)
-    if s.kinematic:
-        mark_touched(a, 0)
-    conclude_lane(a, 0, s)
+    apart_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
+    close_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
+    for start in range(first, last, LANES_AT_ONCE):
+        end = min(start + LANES_AT_ONCE, last)
+        for lane in range(start, end):
+            take_actions(a, lane, s)
+        apart = close = 0
+        for lane in range(start, end):
+            near = are_near(a, lane, s)
+            if near and s.collides:
+                return MUST_COLLIDE
+            if s.has_parts:
+                return MUST_SUBSTEP
+            if near:
+                close_lanes[close], close = lane, close + 1
+            else:
+                apart_lanes[apart], apart = lane, apart + 1
+        move_lanes(a, apart_lanes[:apart], False, s)
+        move_lanes(a, close_lanes[:close], True, s)
+        for lane in range(start, end):
+            conclude_lane(a, lane, s)
     return DONE

@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 
 import numpy as np
 import pymunk
 
 from tlf_env.onboard.parts import Factory
-from tlf_env.physics.parameters import body
+from tlf_env.physics.parameters import Body
 from tlf_env.physics.pymunk_plant import PymunkPlant
 from tlf_env.physics.state import Motion
 from tlf_env.task import drivers
@@ -18,19 +17,15 @@ from tlf_env.task.channels import (
     CHANNELS,
     PATHS,
     PAYLOAD_BEHIND,
-    PAYLOAD_INERTIA,
     PAYLOAD_MASS,
-    START_HEADING,
-    START_POSE,
     START_POSITION,
     STEP_CHANNELS,
 )
-from tlf_env.task.disturbance import loaded_body
 from tlf_env.task.judging import BODY_D
-from tlf_env.task.outlines import BODY_AHEAD, BODY_OUTLINE
 from tlf_env.task.parts import Parts, part_factories
-from tlf_env.task.scenario import START_MARGIN_MM, Scenario
+from tlf_env.task.scenario import Scenario
 from tlf_env.task.settings import settings
+from tlf_env.task.starting import OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.task.trajectories import sample
 
 
@@ -46,12 +41,12 @@ STATE_SCALES = np.array(
 )
 
 
-PAYLOAD = [PAYLOAD_MASS, PAYLOAD_BEHIND, PAYLOAD_INERTIA]
-START_ATTEMPTS = 1000
+ALONE = np.ones(1, dtype=np.bool_)
+NO_POSES = np.zeros((0, 3))
 
 
 class Formation:
-    """State of one formation on the ``pymunk`` or ``kinematic`` plant.
+    """State of one formation on any plant.
 
     Units: mm, s, rad; arrays are views that the next step overwrites. ``parts`` gives factories for
     the ``estimator``, ``wheel_loop`` or ``observer`` that the scenario names, where they are at hand
@@ -61,12 +56,10 @@ class Formation:
     def __init__(self, scenario: Scenario, parts: Mapping[str, Factory] | None = None) -> None:
         self.scenario = scenario
         self._table = reference_table(scenario)
-        self.arrays: Arrays = make_arrays(scenario, self._table)
+        self.arrays: Arrays = make_arrays([scenario], self._table)
         self.plant = PymunkPlant(list(scenario.robot_models))
-        self._factories = part_factories(scenario, parts or {})
-        self._parts = Parts(self._factories, scenario)
+        self._parts = Parts(part_factories(scenario, parts or {}), scenario)
         self._settings = settings(scenario)
-        self._loaded = False
 
     @property
     def time_s(self) -> float:
@@ -95,42 +88,15 @@ class Formation:
         ``poses`` ``(robot, 3)`` (mm, mm, rad) replaces the start poses of c; ``phase_s`` starts the
         leader's reference that much later on its trajectory.
         """
-        a, s = self.arrays, self.scenario
-        for state in (a.motions, a.contacts, a.loop_states, a.sensors, a.estimates, a.traces):
-            state[:] = 0.0
-        for state in (a.actions, a.last_actions, a.infos, a.samples):
-            state[:] = 0.0
-        for flags in (a.lost, a.touched, a.lost_now, a.touched_now):
-            flags[:] = False
-        a.clock[0] = 0, 0, episode
-        a.seeds[0] = seed
-        a.table[:] = reference_table(s, phase_s) if phase_s else self._table
-        for state in (a.processes, a.torques, a.wanted, a.wanted_before):
-            state[:] = 0.0
-        a.dropped[:] = False
-        a.imposed[:] = np.nan
-        drivers.draw_episode(a, 0, self._settings)
-        self._load()
-        poses = scattered(a, start_poses(s, a.table[0])) if poses is None else poses
-        for r, pose in enumerate(poses):
-            self._place(r, *pose)
+        a, s = self.arrays, self._settings
+        a.clock[0], a.seeds[0] = (0, 0, episode), seed
+        a.table[:] = reference_table(self.scenario, phase_s) if phase_s else self._table
+        result, r, _ = drivers.start(a, ALONE, NO_POSES if poses is None else poses, s)
+        if result != STARTED:
+            raise ValueError(refusal(a, result, r))
         self.plant.reset(a.bodies[:, :, 0])
-        drivers.begin(a, 0, self._settings)
-        self._parts.reset(a, self._settings)
-        drivers.look(a, self._settings)
-        for flags in (a.lost, a.lost_now):  # who starts lost is lost in the first step
-            flags[:] = False
-
-    def _load(self) -> None:
-        """Put the payloads on."""
-        a = self.arrays
-        for r, robot in enumerate(self.scenario.robot_models):
-            payload = a.applied[PAYLOAD, r, 0]
-            if payload[0] > 0:
-                a.bodies[:, r, 0] = loaded_body(robot, payload)
-            elif self._loaded:
-                a.bodies[:, r, 0] = body(robot)
-        self._loaded = bool((a.applied[PAYLOAD[0]] > 0).any())
+        self._parts.reset(a, s)
+        drivers.look(a, ALONE, True, s)
 
     def impose(self, values: Mapping[str, float | np.ndarray]) -> None:
         """Set channels for the coming control step: ``{path: value or one per robot}``.
@@ -171,13 +137,6 @@ class Formation:
         """The channels' last values, (robot, channel), channels as in ``PATHS``."""
         return self.arrays.applied[:, :, 0].T
 
-    def _place(self, r: int, x_mm: float, y_mm: float, theta: float) -> None:
-        a, d = self.arrays, self.arrays.bodies[BODY_D, r, 0]
-        a.motions[:4, r, 0] = x_mm + d * np.sin(theta), y_mm - d * np.cos(theta), theta, theta
-        a.estimates[:3, r, 0] = x_mm, y_mm, theta
-        a.observers[:, r, 0] = x_mm, y_mm, theta
-        a.starts[:, r, 0] = x_mm, y_mm, theta
-
     def step(self) -> None:
         """Advance one control step with ``arrays.actions``.
 
@@ -187,13 +146,10 @@ class Formation:
             for an action that is not finite, naming the robot; then nothing has changed.
         """
         a, s = self.arrays, self._settings
-        if not self._parts:
-            result = drivers.control_step(a, s)
-            if result == drivers.DONE:
-                return
-        else:
-            result = drivers.prepare(a, s)
-        if result not in (drivers.DONE, drivers.MUST_COLLIDE):
+        result = drivers.control_step(a, 0, 1, s)
+        if result == drivers.DONE:
+            return
+        if result >= 0:
             raise ValueError(
                 f"robot_{result}: the action must be finite, got {a.actions[0, result].tolist()}"
             )
@@ -203,7 +159,7 @@ class Formation:
             self._parts.observe(a, s)
         else:
             drivers.observe_followers(a, s)
-        drivers.look(a, s)
+        drivers.look(a, ALONE, False, s)
 
     def _substep_by_substep(self, close: bool) -> None:
         a, s = self.arrays, self._settings
@@ -218,71 +174,31 @@ class Formation:
 
     def state(self) -> np.ndarray:
         """The truth, (robot, :class:`State`), in physical units."""
-        return state_rows(self.arrays)
+        return state_rows(self.arrays)[0]
 
 
-def start_poses(scenario: Scenario, first: Sequence[float] | np.ndarray) -> np.ndarray:
-    """Pose of c of every robot at t = 0, (robot, 3): the leader on its reference, the others behind it.
-
-    The followers stand ``start_spacing_mm`` apart on the tangent, with the leader's heading.
-    """
-    x_mm, y_mm, theta = first[0], first[1], first[2]
-    behind = scenario.start_spacing_mm * np.arange(scenario.robot_count)
-    return np.stack(
-        [
-            x_mm + behind * np.sin(theta),
-            y_mm - behind * np.cos(theta),
-            np.full(scenario.robot_count, theta),
-        ],
-        axis=-1,
+def refusal(a: Arrays, result: int, r: int, lane: int = 0) -> str:
+    """Why a lane could not start, in one line."""
+    if result == OFF_BASE:
+        mass, behind = a.applied[PAYLOAD_MASS, r, lane], a.applied[PAYLOAD_BEHIND, r, lane]
+        laden, empty = Body(*a.bodies[:, r, lane]), Body(*a.empty_bodies[:, r, a.variants[lane]])
+        return (
+            f"payload of {mass:g} kg at {behind:g} mm puts the centre of mass {laden.d:g} mm behind "
+            f"the axle; the wheels carry it from 0 to {empty.pivot + empty.T:g} mm"
+        )
+    return (
+        f"robot_{r}: no start pose without overlap in {START_ATTEMPTS} draws with "
+        f"start.position_std_mm {a.applied[START_POSITION, r, lane]:g}; it leaves too little room"
     )
 
 
-def scattered(a: Arrays, poses: np.ndarray) -> np.ndarray:
-    """Start poses with the disturbance's scatter, each robot redrawn while its outline overlaps another's.
-
-    Raises
-    ------
-    ValueError
-        if there is no room after many tries.
-    """
-    if not a.applied[[START_POSITION, START_HEADING]].any():
-        return poses
-    out = poses.copy()
-    for r in range(len(out)):
-        spread = a.applied[START_POSITION, r, 0], a.applied[START_HEADING, r, 0]
-        for attempt in range(START_ATTEMPTS):
-            x, y = drivers.draw_normals(a, 0, START_POSE, r, 2 * attempt)
-            turn, _ = drivers.draw_normals(a, 0, START_POSE, r, 2 * attempt + 1)
-            out[r] = poses[r] + (spread[0] * x, spread[0] * y, spread[1] * turn)
-            if all(_apart(a, out, r, other) for other in range(r)):
-                break
-        else:
-            raise ValueError(
-                f"robot_{r}: no start pose without overlap in {START_ATTEMPTS} draws with "
-                f"start.position_std_mm {spread[0]:g}; it leaves too little room"
-            )
-    return out
-
-
-def _apart(a: Arrays, poses: np.ndarray, i: int, j: int) -> bool:
-    """Whether two robots' outlines are apart at given poses of c."""
-    centres, room = [], 0.0
-    for r in (i, j):
-        ahead = a.bodies[BODY_AHEAD, r, 0] - a.bodies[BODY_D, r, 0]
-        x_mm, y_mm, theta = poses[r]
-        centres.append((x_mm - ahead * np.sin(theta), y_mm + ahead * np.cos(theta)))
-        room += a.bodies[BODY_OUTLINE, r, 0]
-    (x_i, y_i), (x_j, y_j) = centres
-    return math.hypot(x_i - x_j, y_i - y_j) > room + START_MARGIN_MM
-
-
 def state_rows(a: Arrays) -> np.ndarray:
-    """True state of lane 0, (robot, :class:`State`)."""
-    m = Motion(*a.motions[:, :, 0])
-    d = a.bodies[BODY_D, :, 0]
+    """True state, (lane, robot, :class:`State`), in physical units."""
+    m = Motion(*a.motions)
+    d = a.bodies[BODY_D]
     sin, cos = np.sin(m.theta), np.cos(m.theta)
-    slot = a.clock[0, 1] % a.references.shape[1]
+    slots = (a.clock[:, 1] % a.references.shape[1])[None, None, :]
+    x, y = np.take_along_axis(a.references[:2], slots[None], axis=1)[:, 0]
     rows = [
         m.x - d * sin,
         m.y + d * cos,
@@ -294,7 +210,7 @@ def state_rows(a: Arrays) -> np.ndarray:
         m.w,
         m.omega_l,
         m.omega_r,
-        a.references[0, slot, :, 0],
-        a.references[1, slot, :, 0],
+        x,
+        y,
     ]
-    return np.stack(rows, axis=-1)
+    return np.stack(rows, axis=-1).transpose(1, 0, 2)

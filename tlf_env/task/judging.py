@@ -11,7 +11,16 @@ from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.tracking import body_errors
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Body
 from tlf_env.physics.state import axle_midpoint, read_motion
-from tlf_env.task.arrays import Arrays, Info, read_trace
+from tlf_env.task.arrays import (
+    HORIZON,
+    LOST,
+    OTHER_ROBOT,
+    RUNNING,
+    TOUCHED,
+    Arrays,
+    Info,
+    read_trace,
+)
 from tlf_env.task.measures import distance, time_gap_error
 from tlf_env.task.observation import SensorTail, Tracking, preview_entries, scaled
 from tlf_env.task.radio import delayed_message, read_reference
@@ -174,3 +183,25 @@ def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
         a.terms[lane, r, i] = terms[i]
         total += a.weights[i] * terms[i]
     a.rewards[lane, r] = total
+
+
+@block
+def end_lane(a: Arrays, lane: int, s: Settings) -> None:
+    """Whether and why the episode ended in this step: for the whole formation at once.
+
+    The robots concerned are terminated, the others truncated; the horizon truncates all.
+    """
+    rest = HORIZON if a.clock[lane, 1] >= s.horizon else RUNNING
+    for r in range(a.ends.shape[1]):
+        a.ends[lane, r] = RUNNING
+        if s.end_on_lost and a.lost_now[lane, r]:
+            a.ends[lane, r] = LOST
+        if s.end_on_touched and a.touched_now[lane, r]:
+            a.ends[lane, r] = TOUCHED
+        if a.ends[lane, r] != RUNNING:
+            rest = OTHER_ROBOT
+    for r in range(a.ends.shape[1]):
+        a.terminated[lane, r] = a.ends[lane, r] != RUNNING
+        a.truncated[lane, r] = rest != RUNNING and not a.terminated[lane, r]
+        if a.truncated[lane, r]:
+            a.ends[lane, r] = rest

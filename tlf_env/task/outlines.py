@@ -15,6 +15,7 @@ CLOSE_MARGIN_MM = 10.0
 FASTEST_CHANGE_MM_S2 = 1500.0  # above what all three tyres can do at twice the paper's friction
 BODY_OUTLINE = Body._fields.index("outline_radius")
 BODY_AHEAD = Body._fields.index("outline_ahead")
+BODY_BEHIND = Body._fields.index("outline_behind")
 
 
 @law

@@ -17,7 +17,6 @@ from tlf_env.task.settings import Settings
 SPEEDS = [Sensors._fields.index("speed_l"), Sensors._fields.index("speed_r")]
 STEPS = [Sample._fields.index("step_l"), Sample._fields.index("step_r")]
 FIXES = [Sample._fields.index("fix_x"), Sample._fields.index("fix_y")]
-BUILT_IN_ESTIMATORS = ("ekf", "truth")
 
 
 def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[str, Factory]:
@@ -28,20 +27,13 @@ def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[s
     ValueError
         for a part that cannot be imported.
     """
-    named = {
-        "estimator": scenario.estimator if scenario.estimator not in BUILT_IN_ESTIMATORS else None,
-        "wheel_loop": scenario.wheel_loop,
-        "observer": scenario.observer,
-    }
     return {
-        role: at_hand.get(role) or load_part(path)
-        for role, path in named.items()
-        if isinstance(path, str)
+        role: at_hand.get(role) or load_part(path) for role, path in scenario.part_paths.items()
     }
 
 
 class Parts:
-    """One object per robot and role; false if there is none."""
+    """One object per robot and role."""
 
     def __init__(self, factories: Mapping[str, Factory], scenario: Scenario) -> None:
         self._factories = factories
@@ -52,9 +44,6 @@ class Parts:
             "observer": scenario.control_period_s,
         }
         self._made: dict[str, list[Any]] = {}
-
-    def __bool__(self) -> bool:
-        return bool(self._factories)
 
     def reset(self, a: Arrays, s: Settings) -> None:
         """Make all parts anew and start them; observers run ahead by the preview."""

@@ -26,6 +26,7 @@ from tlf_env.task.waypoints import scenario_of_waypoints
 
 PACKAGE = Path(__file__).resolve().parent.parent
 MAX_ROBOTS = 1000
+BUILT_IN_ESTIMATORS = ("ekf", "truth")
 DEFAULT_CONTROL_PERIOD_S = 0.02
 SETTLE_FRACTION = 0.4
 START_MARGIN_MM = 1.0  # between outlines at the start
@@ -112,7 +113,7 @@ class Scenario(Frozen):
     physics_period_s: Positive = 0.001
     control_period_s: Positive = DEFAULT_CONTROL_PERIOD_S
     horizon_s: Positive = 100.0
-    plant: Literal["pymunk", "kinematic"] = "pymunk"
+    plant: Literal["pymunk", "batch", "kinematic"] = "pymunk"
 
     wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
     estimator: Literal["ekf", "truth"] | PartPath = "ekf"
@@ -223,7 +224,22 @@ class Scenario(Frozen):
             raise ValueError(
                 "plant 'kinematic' has no torques: no action 'torque', no wheel_loop part"
             )
+        if self.plant == "batch":
+            self.check_lanes()
         return self
+
+    def check_lanes(self) -> None:
+        """Check that many formations can run at once, without Python in the step.
+
+        Raises
+        ------
+        ValueError
+            naming the field that hinders it.
+        """
+        for role, path in self.part_paths.items():
+            raise ValueError(f"{role} {path!r} is an object in Python, which no batch can run")
+        if self.adversary:
+            raise ValueError("adversary True: channels cannot be set from outside in a batch")
 
     @property
     def robot_count(self) -> int:
@@ -236,6 +252,16 @@ class Scenario(Frozen):
         if isinstance(self.robots, int):
             return (self.robot,) * self.robots
         return self.robots
+
+    @property
+    def part_paths(self) -> dict[str, str]:
+        """The onboard parts of one's own, by role."""
+        named = {role: getattr(self, role) for role in ("estimator", "wheel_loop", "observer")}
+        return {
+            role: part
+            for role, part in named.items()
+            if isinstance(part, str) and part not in BUILT_IN_ESTIMATORS
+        }
 
     @property
     def privileged(self) -> bool:

@@ -17,16 +17,22 @@ class Settings(NamedTuple):
     """Numbers of a scenario that all robots share."""
 
     kinematic: bool
+    collides: bool  # robots that are near are stepped through a space with contact
     substeps: int
     dt: float  # physics period, s
     period: float  # control period, s
     gap: int  # control steps of the time gap
     lookahead: int  # control steps of the longest preview
+    horizon: int  # control steps of an episode
+    spacing: float  # mm between neighbours at the start
     window: int  # control steps around one gap ago in which the time gap is measured
     observer_gain: float  # 1/s
     smoothing: float  # s
     lost_beyond: float  # mm
+    end_on_lost: bool
+    end_on_touched: bool
     estimator: int  # EKF, TRUTH or EXTERNAL
+    has_parts: bool  # objects in Python that are called between the substeps
     external_wheel_loop: bool
     external_observer: bool
     cooperative: bool  # every robot gets the formation's mean reward
@@ -42,16 +48,22 @@ def settings(scenario: Scenario) -> Settings:
     kinds = {"ekf": EKF, "truth": TRUTH}
     return Settings(
         kinematic=scenario.plant == "kinematic",
+        collides=scenario.plant == "pymunk",
         substeps=scenario.substeps,
         dt=scenario.physics_period_s,
         period=scenario.control_period_s,
         gap=scenario.gap_steps,
         lookahead=max(scenario.preview_steps, default=0),
+        horizon=scenario.horizon_steps,
+        spacing=scenario.start_spacing_mm,
         window=round(TIME_GAP_WINDOW_S / scenario.control_period_s),
         observer_gain=paper.gain_per_s,
         smoothing=paper.smoothing_s,
         lost_beyond=scenario.lost_beyond_mm,
+        end_on_lost="lost" in scenario.end_on,
+        end_on_touched="touched" in scenario.end_on,
         estimator=kinds.get(scenario.estimator, EXTERNAL),
+        has_parts=bool(scenario.part_paths),
         external_wheel_loop=isinstance(scenario.wheel_loop, str),
         external_observer=isinstance(observer, str),
         cooperative=scenario.cooperative,

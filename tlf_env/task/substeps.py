@@ -230,10 +230,9 @@ def delays(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
 @block
 def evaluate(a: Arrays, lane: int, r: int, first: int, last: int, tick: int, s: Settings) -> None:
     """Evaluate the channels from ``first`` to before ``last`` for one robot at a tick."""
+    signals = a.signals[a.variants[lane]]
     for c in range(first, last):
-        row = SignalRow(
-            a.signals[c, 0], a.signals[c, 1], a.signals[c, 2], a.signals[c, 3], a.signals[c, 4]
-        )
+        row = SignalRow(signals[c, 0], signals[c, 1], signals[c, 2], signals[c, 3], signals[c, 4])
         value, a.processes[c, r, lane] = signal_value(
             row,
             tick,

@@ -29,6 +29,7 @@ from tlf_env.task.actions import TORQUE
 from tlf_env.task.arrays import Arrays, Sample, Sensors, Trace
 from tlf_env.task.channels import SUBSTEP_CHANNELS
 from tlf_env.task.disturbance import Effects, wheel_factors
+from tlf_env.task.outlines import mark_touched
 from tlf_env.task.settings import Settings
 from tlf_env.task.substeps import (
     EXTERNAL_TORQUE,
@@ -130,34 +131,45 @@ def whole(tile: np.ndarray) -> np.ndarray:
 
 
 @law
-def load(tile: np.ndarray, first: int, array: np.ndarray) -> None:
-    """Copy an array's fields (field, robot, lane) into the tile's rows from ``first`` on."""
-    columns = tile.view(np.uint64)[COLUMN]
-    flat = array.reshape((array.shape[0], array.shape[1] * array.shape[2]))
-    for f in range(array.shape[0]):
-        for i in range(WIDTH):
-            tile[first + f, i] = flat[f, columns[i]]
+def columns_of(tile: np.ndarray) -> np.ndarray:
+    """The row of columns; unsigned, so that no index can count from an array's end."""
+    return tile.view(np.uint64)[COLUMN]
 
 
 @law
-def store(tile: np.ndarray, first: int, array: np.ndarray, count: int) -> None:
+def flat(array: np.ndarray) -> np.ndarray:
+    """An array (field, robot, lane) as (field, column)."""
+    return array.reshape((array.shape[0], array.shape[1] * array.shape[2]))
+
+
+@law
+def load(tile: np.ndarray, first: int, array: np.ndarray, columns: np.ndarray) -> None:
+    """Copy a flat array's fields into the tile's rows from ``first`` on."""
+    for f in range(array.shape[0]):
+        for i in range(WIDTH):
+            tile[first + f, i] = array[f, columns[i]]
+
+
+@law
+def store(tile: np.ndarray, first: int, array: np.ndarray, columns: np.ndarray, count: int) -> None:
     """Copy the tile's rows from ``first`` on back, for its first ``count`` items."""
-    columns = tile.view(np.uint64)[COLUMN]
-    flat = array.reshape((array.shape[0], array.shape[1] * array.shape[2]))
     for f in range(array.shape[0]):
         for i in range(count):
-            flat[f, columns[i]] = tile[first + f, i]
+            array[f, columns[i]] = tile[first + f, i]
 
 
-@block
-def load_tile(
-    a: Arrays, tile: np.ndarray, first_lane: int, lanes: int, item: int, count: int, s: Settings
+@law
+def assign(
+    a: Arrays, tile: np.ndarray, lanes: np.ndarray, item: int, count: int, s: Settings
 ) -> None:
-    """Fill a tile with ``count`` items from ``item`` on: robots of ``lanes`` lanes from ``first_lane`` on."""
+    """Write who a tile's items are and what they are asked for: ``count`` of them, from ``item`` on.
+
+    Items are the robots 0 of the given lanes, then the robots 1, and so on.
+    """
     numbers = whole(tile)
     for i in range(WIDTH):
         j = item + min(i, count - 1)
-        r, lane = j // lanes, first_lane + j % lanes
+        r, lane = j // lanes.shape[0], lanes[j % lanes.shape[0]]
         numbers[COLUMN, i] = r * a.motions.shape[2] + lane
         set_draw(numbers, i, Draw(a.seeds[lane], r, a.clock[lane, 2], a.clock[lane, 0]))
         kind = a.kinds[r, lane]
@@ -174,27 +186,6 @@ def load_tile(
             dead,
         )
         set_order(tile, i, order)
-    load(tile, BODY, a.bodies)
-    load(tile, LOOP, a.wheel_loops)
-    load(tile, EKF_ROW, a.ekfs)
-    load(tile, EFFECTS, a.applied[:SUBSTEP_CHANNELS])
-    load(tile, MOTION, a.motions)
-    load(tile, CONTACT, a.contacts)
-    load(tile, HELD, a.loop_states)
-    load(tile, SENSORS, a.sensors)
-    load(tile, ESTIMATE, a.estimates)
-    load(tile, TRACE, a.traces)
-
-
-@block
-def store_tile(a: Arrays, tile: np.ndarray, count: int) -> None:
-    """Put the first ``count`` items of a tile back."""
-    store(tile, MOTION, a.motions, count)
-    store(tile, CONTACT, a.contacts, count)
-    store(tile, HELD, a.loop_states, count)
-    store(tile, SENSORS, a.sensors, count)
-    store(tile, ESTIMATE, a.estimates, count)
-    store(tile, TRACE, a.traces, count)
 
 
 @block
@@ -204,7 +195,7 @@ def change_effects(a: Arrays, tile: np.ndarray, count: int, s: Settings) -> None
     for i in range(count):
         draw, column = draw_of(whole(tile), i), whole(tile)[COLUMN, i]
         evaluate(a, column % lanes, draw.robot, 0, SUBSTEP_CHANNELS, draw.tick, s)
-    load(tile, EFFECTS, a.applied[:SUBSTEP_CHANNELS])
+    load(tile, EFFECTS, flat(a.applied[:SUBSTEP_CHANNELS]), columns_of(tile))
 
 
 @block
@@ -238,11 +229,13 @@ def delay_torques(torques: np.ndarray, tile: np.ndarray, count: int) -> None:
 
 
 @block
-def meet_patches(patches: np.ndarray, tile: np.ndarray, count: int) -> None:
+def meet_patches(patches: np.ndarray, variants: np.ndarray, tile: np.ndarray, count: int) -> None:
     """Scale the friction of the tyres that stand on a patch."""
     for i in range(count):
-        drive = drive_of(tile, i)
-        on_l, on_r, on_c = wheel_factors(patches, body_of(tile, i), motion_of(tile, i))
+        drive, lane = drive_of(tile, i), whole(tile)[COLUMN, i] % variants.shape[0]
+        on_l, on_r, on_c = wheel_factors(
+            patches[variants[lane]], body_of(tile, i), motion_of(tile, i)
+        )
         set_drive(
             tile,
             i,
@@ -386,6 +379,7 @@ def actuate_tile(
     count: int,
     torques: np.ndarray,
     patches: np.ndarray,
+    variants: np.ndarray,
     k: int,
     kinematic: bool,
     dt: float,
@@ -397,55 +391,74 @@ def actuate_tile(
         ask(tile, k)
         if torques.shape[1] > 1:
             delay_torques(torques, tile, count)
-        if patches.shape[0] > 0:
-            meet_patches(patches, tile, count)
+        if patches.shape[1] > 0:
+            meet_patches(patches, variants, tile, count)
         move(tile, count, dt)
 
 
 @block
-def advance(a: Arrays, first: int, last: int, s: Settings) -> None:
-    """All substeps of a control step of the lanes from ``first`` to before ``last``, without contact."""
-    lanes = last - first
-    items = lanes * a.motions.shape[1]
+def advance(
+    a: Arrays, lanes: np.ndarray, begin: int, end: int, actuates: bool, senses: bool, s: Settings
+) -> None:
+    """Run the substeps ``begin`` to before ``end`` of a control step of some lanes, without contact.
+
+    Without ``senses`` each stops after the plant's new velocities and poses, and without ``actuates`` it
+    begins there.
+    """
+    # Every use of an array through the tuple counts its references; here that is done once.
+    bodies, loops, ekfs = flat(a.bodies), flat(a.wheel_loops), flat(a.ekfs)
+    applied = flat(a.applied[:SUBSTEP_CHANNELS])
+    motions, contacts, traces = flat(a.motions), flat(a.contacts), flat(a.traces)
+    held, sensors, estimates = flat(a.loop_states), flat(a.sensors), flat(a.estimates)
+    samples = a.samples.reshape((*a.samples.shape[:2], a.motions.shape[1] * a.motions.shape[2]))
+    torques, patches, variants = a.torques, a.patches, a.variants
     tile = np.empty((ROWS, WIDTH))
-    samples, torques, patches = a.samples, a.torques, a.patches  # counting references costs time
+    columns = columns_of(tile)
+    items = lanes.shape[0] * a.motions.shape[1]
     for item in range(0, items, WIDTH):
         count = min(WIDTH, items - item)
-        load_tile(a, tile, first, lanes, item, count, s)
-        for k in range(s.substeps):
-            if s.changing:
-                change_effects(a, tile, count, s)
-            actuate_tile(tile, count, torques, patches, k, s.kinematic, s.dt)
-            sense_tile(tile, s.estimator, s.dt)
-            store(tile, SAMPLE, samples[k], count)
-        store_tile(a, tile, count)
-    for lane in range(first, last):
-        a.clock[lane, 0] += s.substeps
+        assign(a, tile, lanes, item, count, s)
+        load(tile, BODY, bodies, columns)
+        load(tile, LOOP, loops, columns)
+        load(tile, EKF_ROW, ekfs, columns)
+        load(tile, EFFECTS, applied, columns)
+        load(tile, MOTION, motions, columns)
+        load(tile, CONTACT, contacts, columns)
+        load(tile, HELD, held, columns)
+        load(tile, SENSORS, sensors, columns)
+        load(tile, ESTIMATE, estimates, columns)
+        load(tile, TRACE, traces, columns)
+        for k in range(begin, end):
+            if actuates:
+                if s.changing:
+                    change_effects(a, tile, count, s)
+                actuate_tile(tile, count, torques, patches, variants, k, s.kinematic, s.dt)
+            if senses:
+                sense_tile(tile, s.estimator, s.dt)
+                for f in range(samples.shape[1]):
+                    for i in range(count):
+                        samples[k, f, columns[i]] = tile[SAMPLE + f, i]
+        store(tile, MOTION, motions, columns, count)
+        store(tile, CONTACT, contacts, columns, count)
+        store(tile, HELD, held, columns, count)
+        store(tile, SENSORS, sensors, columns, count)
+        store(tile, ESTIMATE, estimates, columns, count)
+        store(tile, TRACE, traces, columns, count)
+    if senses:
+        for i in range(lanes.shape[0]):
+            a.clock[lanes[i], 0] += end - begin
 
 
 @block
-def actuate_lane(a: Arrays, lane: int, k: int, s: Settings) -> None:
-    """The first half of substep ``k`` of one lane: everything up to the new velocities and poses."""
-    items = a.motions.shape[1]
-    tile = np.empty((ROWS, WIDTH))
-    for item in range(0, items, WIDTH):
-        count = min(WIDTH, items - item)
-        load_tile(a, tile, lane, 1, item, count, s)
-        if s.changing:
-            change_effects(a, tile, count, s)
-        actuate_tile(tile, count, a.torques, a.patches, k, s.kinematic, s.dt)
-        store_tile(a, tile, count)
+def move_lanes(a: Arrays, lanes: np.ndarray, near: bool, s: Settings) -> None:
+    """Run the substeps of a control step of some lanes without contact: robots pass through each other.
 
-
-@block
-def sense_lane(a: Arrays, lane: int, k: int, s: Settings) -> None:
-    """The second half of substep ``k`` of one lane: sensors and estimators."""
-    items = a.motions.shape[1]
-    tile = np.empty((ROWS, WIDTH))
-    for item in range(0, items, WIDTH):
-        count = min(WIDTH, items - item)
-        load_tile(a, tile, lane, 1, item, count, s)
-        sense_tile(tile, s.estimator, s.dt)
-        store(tile, SAMPLE, a.samples[k], count)
-        store_tile(a, tile, count)
-    a.clock[lane, 0] += 1
+    While they are ``near``, each substep asks which outlines meet, so that the first touch is marked
+    where a plant with contact marks it.
+    """
+    at_once = 1 if near else s.substeps
+    for begin in range(0, s.substeps, at_once):
+        advance(a, lanes, begin, begin + at_once, True, True, s)
+        if near or s.kinematic:
+            for i in range(lanes.shape[0]):
+                mark_touched(a, lanes[i])
