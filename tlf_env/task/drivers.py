@@ -45,7 +45,7 @@ from tlf_env.task.radio import broadcast, message_slot, next_reference
 from tlf_env.task.settings import Settings
 from tlf_env.task.starting import STARTED, fill, start_lane
 from tlf_env.task.substeps import delays, evaluate
-from tlf_env.task.tiles import advance, move_lanes
+from tlf_env.task.tiles import advance
 
 DONE, MUST_COLLIDE, MUST_SUBSTEP = -1, -2, -3
 FIRST_LANE = np.zeros(1, dtype=np.int64)
@@ -213,6 +213,13 @@ def sense(a: Arrays, k: int, s: Settings) -> None:
     mark_touched(a, 0)
 
 
+@block
+def mark_all_touched(a: Arrays, lanes: np.ndarray) -> None:
+    """:func:`mark_touched` of some lanes."""
+    for i in range(lanes.shape[0]):
+        mark_touched(a, lanes[i])
+
+
 @driver
 def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
     """A whole control step of the lanes from ``first`` to before ``last``.
@@ -242,8 +249,16 @@ def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
                 close_lanes[close], close = lane, close + 1
             else:
                 apart_lanes[apart], apart = lane, apart + 1
-        move_lanes(a, apart_lanes[:apart], False, s)
-        move_lanes(a, close_lanes[:close], True, s)
+        lanes = apart_lanes[:apart]
+        advance(a, lanes, 0, s.substeps, True, True, s)
+        if s.kinematic:
+            mark_all_touched(a, lanes)
+        # Robots pass through each other here. While they are close, each substep asks which outlines
+        # meet, so that the first touch is marked where a plant with contact marks it.
+        lanes = close_lanes[:close]
+        for k in range(s.substeps if close > 0 else 0):
+            advance(a, lanes, k, k + 1, True, True, s)
+            mark_all_touched(a, lanes)
         for lane in range(start, end):
             conclude_lane(a, lane, s)
     return DONE

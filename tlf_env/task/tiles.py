@@ -29,7 +29,6 @@ from tlf_env.task.actions import TORQUE
 from tlf_env.task.arrays import Arrays, Sample, Sensors, Trace
 from tlf_env.task.channels import SUBSTEP_CHANNELS
 from tlf_env.task.disturbance import Effects, wheel_factors
-from tlf_env.task.outlines import mark_touched
 from tlf_env.task.settings import Settings
 from tlf_env.task.substeps import (
     EXTERNAL_TORQUE,
@@ -373,29 +372,6 @@ def sense_tile(tile: np.ndarray, estimator: int, dt: float) -> None:
         set_sample(tile, i, sample)
 
 
-@law
-def actuate_tile(
-    tile: np.ndarray,
-    count: int,
-    torques: np.ndarray,
-    patches: np.ndarray,
-    variants: np.ndarray,
-    k: int,
-    kinematic: bool,
-    dt: float,
-) -> None:
-    """Substep ``k`` up to the plant's new velocities and poses. The arrays are those of :class:`Arrays`."""
-    if kinematic:
-        follow(tile, k, dt)
-    else:
-        ask(tile, k)
-        if torques.shape[1] > 1:
-            delay_torques(torques, tile, count)
-        if patches.shape[1] > 0:
-            meet_patches(patches, variants, tile, count)
-        move(tile, count, dt)
-
-
 @block
 def advance(
     a: Arrays, lanes: np.ndarray, begin: int, end: int, actuates: bool, senses: bool, s: Settings
@@ -432,7 +408,15 @@ def advance(
             if actuates:
                 if s.changing:
                     change_effects(a, tile, count, s)
-                actuate_tile(tile, count, torques, patches, variants, k, s.kinematic, s.dt)
+                if s.kinematic:
+                    follow(tile, k, s.dt)
+                else:
+                    ask(tile, k)
+                    if torques.shape[1] > 1:
+                        delay_torques(torques, tile, count)
+                    if patches.shape[1] > 0:
+                        meet_patches(patches, variants, tile, count)
+                    move(tile, count, s.dt)
             if senses:
                 sense_tile(tile, s.estimator, s.dt)
                 for f in range(samples.shape[1]):
@@ -447,18 +431,3 @@ def advance(
     if senses:
         for i in range(lanes.shape[0]):
             a.clock[lanes[i], 0] += end - begin
-
-
-@block
-def move_lanes(a: Arrays, lanes: np.ndarray, near: bool, s: Settings) -> None:
-    """Run the substeps of a control step of some lanes without contact: robots pass through each other.
-
-    While they are ``near``, each substep asks which outlines meet, so that the first touch is marked
-    where a plant with contact marks it.
-    """
-    at_once = 1 if near else s.substeps
-    for begin in range(0, s.substeps, at_once):
-        advance(a, lanes, begin, begin + at_once, True, True, s)
-        if near or s.kinematic:
-            for i in range(lanes.shape[0]):
-                mark_touched(a, lanes[i])
