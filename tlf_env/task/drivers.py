@@ -2,7 +2,7 @@
 
 One control step runs, for every robot and substep, wheel loop → torques → disturbances → plant →
 sensors → EKF, and then once per robot radio → observer → observation, reward, errors. Robots do not
-act on each other within a control step unless they touch, so each runs its substeps by itself; the
+act on each other within a control step unless they touch, so the substeps of all run side by side; the
 pymunk plant calls :func:`actuate` and :func:`sense` one substep at a time while robots are close.
 """
 
