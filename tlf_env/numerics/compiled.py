@@ -128,3 +128,19 @@ def slot_writer(row: type[Any]) -> Callable[..., Any]:
     scope: dict[str, Any] = {}
     exec(f"def write(a, k, r, l, row):\n{lines}\n", scope)
     return law(scope["write"])
+
+
+def row_reader(row: type[Any], first: int) -> Callable[..., Any]:
+    """Compiled ``read(tile, i)`` that gathers a named tuple from ``tile[first + field, i]``."""
+    fields = ", ".join(f"t[{first + i}, i]" for i in range(len(row._fields)))
+    scope: dict[str, Any] = {"Row": row}
+    exec(f"def read(t, i):\n    return Row({fields})\n", scope)
+    return law(scope["read"])
+
+
+def row_writer(row: type[Any], first: int) -> Callable[..., Any]:
+    """Compiled ``write(tile, i, row)``, the inverse of :func:`row_reader`."""
+    lines = "\n".join(f"    t[{first + i}, i] = row.{name}" for i, name in enumerate(row._fields))
+    scope: dict[str, Any] = {}
+    exec(f"def write(t, i, row):\n{lines}\n", scope)
+    return law(scope["write"])

@@ -6,10 +6,10 @@ The filter assumes wheels that do not slip.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.trig import sincos
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
 
@@ -67,8 +67,7 @@ def odometry(angle_l: float, angle_r: float, R: float, h: float) -> tuple[float,
 @law
 def predict(e: Estimate, ekf: Ekf, u_1: float, u_2: float) -> Estimate:
     """Eqs (28), (36), (38): pose and covariance one sample on, for increments u₁ (mm), u₂ (rad)."""
-    middle = e.theta + 0.5 * u_2
-    sin, cos = math.sin(middle), math.cos(middle)
+    sin, cos = sincos(e.theta + 0.5 * u_2)
     sd_1 = ekf.alpha_1 * abs(u_1) + ekf.alpha_2 * abs(u_2)
     sd_2 = ekf.alpha_3 * abs(u_1) + ekf.alpha_4 * abs(u_2)
     var_1, var_2 = sd_1 * sd_1, sd_2 * sd_2

@@ -7,10 +7,10 @@ noise is a variance per second, so that the filter is the same at every sampling
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.trig import sincos
 from tlf_env.onboard.estimator import Estimate
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
@@ -83,7 +83,7 @@ def predict_with_slip(
     """Pose, slip and covariance one sample on, for increments u₁ (mm) and u₂ (rad) of the wheels."""
     moved, turned = u_1 + z.delta_1 * dt, u_2 + z.delta_2 * dt
     middle = e.theta + 0.5 * turned
-    sin, cos = math.sin(middle), math.cos(middle)
+    sin, cos = sincos(middle)
     # F = I but for ∂(x, y)/∂θ = f, ∂(x, y)/∂δ₁ = h, ∂(x, y)/∂δ₂ = g, ∂θ/∂δ₂ = dt.
     f_x, f_y = -moved * cos, -moved * sin
     h_x, h_y = -sin * dt, cos * dt

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law
+from tlf_env.numerics.trig import sincos
 from tlf_env.onboard.limiter import Limits, TwistLimits, limits_row
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
@@ -131,7 +132,7 @@ def gains_row(gains: TrackingGains) -> Gains:
 @law
 def body_errors(d_x: float, d_y: float, theta: float) -> tuple[float, float]:
     """Eq. (16), position part: e₁ forward and e₂ to the right (mm), for reference − robot in world axes."""
-    sin, cos = math.sin(theta), math.cos(theta)
+    sin, cos = sincos(theta)
     return -sin * d_x + cos * d_y, cos * d_x + sin * d_y
 
 

@@ -7,7 +7,7 @@ import math
 from tlf_env.numerics.compiled import law
 
 NEWTON_STEPS = 60
-CIRCLE_TOLERANCE = 1e-14
+CIRCLE_TOLERANCE = 1e-12  # relative
 
 
 @law
@@ -32,25 +32,30 @@ def disc(
     """
     if radius <= 0.0:
         return 0.0, 0.0, math.inf
-    det = w_ee * w_ff - w_ef * w_ef
-    p_e = -(w_ff * b_e - w_ef * b_f) / det
-    p_f = -(w_ee * b_f - w_ef * b_e) / det
-    norm = math.sqrt(p_e * p_e + p_f * p_f)
-    if norm <= radius:
+    inverse = 1.0 / (w_ee * w_ff - w_ef * w_ef)
+    p_e = (w_ef * b_f - w_ff * b_e) * inverse
+    p_f = (w_ef * b_e - w_ee * b_f) * inverse
+    square = p_e * p_e + p_f * p_f
+    if square <= radius * radius:
         return p_e, p_f, 0.0
-    # Find λ with |(W + λ1)⁻¹ b| = radius: Newton on 1/|p|, from a bound at or below the root.
-    largest = 0.5 * (w_ee + w_ff) + math.sqrt(0.25 * (w_ee - w_ff) ** 2 + w_ef * w_ef)
-    lam = max(0.0, math.sqrt(b_e * b_e + b_f * b_f) / radius - largest)
+    # Find λ with |(W + λ1)⁻¹ b| = radius: Newton on 1/|p|, which is concave in λ, so that from the second
+    # step on λ rises to the root. It starts with the step from λ = ∞.
+    inverse_radius = 1.0 / radius
+    size = b_e * b_e + b_f * b_f
+    weighted = w_ee * b_e * b_e + 2.0 * w_ef * b_e * b_f + w_ff * b_f * b_f
+    lam = max(0.0, math.sqrt(size) * inverse_radius - weighted / size)
+    norm = radius
     for _ in range(NEWTON_STEPS):
         a, c = w_ee + lam, w_ff + lam
-        det = a * c - w_ef * w_ef
-        p_e = -(c * b_e - w_ef * b_f) / det
-        p_f = -(a * b_f - w_ef * b_e) / det
-        norm = math.sqrt(p_e * p_e + p_f * p_f)
-        excess = norm - radius
-        if abs(excess) <= CIRCLE_TOLERANCE * radius:
+        inverse = 1.0 / (a * c - w_ef * w_ef)
+        p_e = (w_ef * b_f - c * b_e) * inverse
+        p_f = (w_ef * b_e - a * b_f) * inverse
+        square = p_e * p_e + p_f * p_f
+        norm = math.sqrt(square)
+        excess = norm * inverse_radius - 1.0
+        if abs(excess) <= CIRCLE_TOLERANCE:
             break
-        curvature = (c * p_e * p_e - 2.0 * w_ef * p_e * p_f + a * p_f * p_f) / det
-        lam = max(0.0, lam + norm * norm / curvature * excess / radius)
+        curvature = (c * p_e * p_e - 2.0 * w_ef * p_e * p_f + a * p_f * p_f) * inverse
+        lam = max(0.0, lam + square / curvature * excess)
     scale = radius / norm
     return p_e * scale, p_f * scale, lam

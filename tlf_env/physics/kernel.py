@@ -1,23 +1,36 @@
 """The wheel kernel: one substep of one robot, implicit in all friction (``docs/physics.md``).
 
 Frames are taken at mid attitude; torques and pushes enter as impulses; then the impulses of floor and
-friction follow, in closed form where all wheels roll and by sweeps where not.
+friction follow, in closed form where all wheels roll (:func:`roll`) and by sweeps where not (:func:`slide`).
 """
 
 from __future__ import annotations
 
-import math
+from typing import NamedTuple
 
-from tlf_env.numerics.compiled import block
-from tlf_env.physics.limits import limits
+from tlf_env.numerics.compiled import block, law
+from tlf_env.numerics.trig import sincos
+from tlf_env.physics.limits import Limits, limits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.rolling import rolling
 from tlf_env.physics.state import Contact, Floor, Motion, Push, Rates
 from tlf_env.physics.sweeps import sweep
 
 
-@block
-def substep(
+class Setting(NamedTuple):
+    """What the impulses of floor and friction are solved for."""
+
+    sin_t: float  # heading at mid attitude
+    cos_t: float
+    sin_p: float  # castor angle at mid attitude
+    cos_p: float
+    before: Rates  # velocities at the substep's start
+    free: Rates  # the same, with torques and pushes
+    limits: Limits
+
+
+@law
+def setting(
     body: Body,
     motion: Motion,
     contact: Contact,
@@ -26,17 +39,10 @@ def substep(
     torque_l: float,
     torque_r: float,
     dt: float,
-) -> tuple[Motion, Contact]:
-    """Velocities after one substep; the pose is left to :func:`tlf_env.physics.state.advance_pose`.
-
-    Torques in mN·mm, ``dt`` in s. Fork and wheel angles are advanced here with the new rates.
-    """
-    theta = motion.theta + 0.5 * dt * motion.w
-    phi = motion.psi - motion.theta + 0.5 * dt * (motion.s - motion.w)
-    cos_t, sin_t = math.cos(theta), math.sin(theta)
-    cos_p, sin_p = math.cos(phi), math.sin(phi)
-
-    most = limits(body, motion, contact, floor, dt)
+) -> Setting:
+    """Frames at mid attitude, velocities without floor and friction, and the friction's limits."""
+    sin_t, cos_t = sincos(motion.theta + 0.5 * dt * motion.w)
+    sin_p, cos_p = sincos(motion.psi - motion.theta + 0.5 * dt * (motion.s - motion.w))
     v_x = motion.v_x + push.f_x * dt * body.inverse_m
     v_y = motion.v_y + push.f_y * dt * body.inverse_m
     before = Rates(
@@ -57,24 +63,80 @@ def substep(
         motion.omega_r + torque_r * dt * body.inverse_J,
         motion.omega_c,
     )
-    rolls, after, impulses = rolling(body, free, before, cos_p, sin_p, floor, most)
-    if not rolls:
-        after, impulses = sweep(body, free, contact, cos_p, sin_p, floor, most)
-    return (
-        Motion(
-            motion.x,
-            motion.y,
-            motion.theta,
-            motion.psi + dt * after.s,
-            cos_t * after.v_e - sin_t * after.v_f,
-            sin_t * after.v_e + cos_t * after.v_f,
-            after.w,
-            after.s,
-            after.omega_l,
-            after.omega_r,
-            after.omega_c,
-            motion.angle_l + dt * after.omega_l,
-            motion.angle_r + dt * after.omega_r,
-        ),
-        impulses,
+    most = limits(body, motion, contact, floor, dt)
+    return Setting(sin_t, cos_t, sin_p, cos_p, before, free, most)
+
+
+@law
+def moved(motion: Motion, at: Setting, after: Rates, dt: float) -> Motion:
+    """The motion with new velocities, in world axes; fork and wheel angles advanced with them."""
+    return Motion(
+        motion.x,
+        motion.y,
+        motion.theta,
+        motion.psi + dt * after.s,
+        at.cos_t * after.v_e - at.sin_t * after.v_f,
+        at.sin_t * after.v_e + at.cos_t * after.v_f,
+        after.w,
+        after.s,
+        after.omega_l,
+        after.omega_r,
+        after.omega_c,
+        motion.angle_l + dt * after.omega_l,
+        motion.angle_r + dt * after.omega_r,
     )
+
+
+@law
+def roll(
+    body: Body,
+    motion: Motion,
+    contact: Contact,
+    floor: Floor,
+    push: Push,
+    torque_l: float,
+    torque_r: float,
+    dt: float,
+) -> tuple[bool, Motion, Contact]:
+    """A substep in closed form, and whether it holds: whether all three wheels roll."""
+    at = setting(body, motion, contact, floor, push, torque_l, torque_r, dt)
+    rolls, after, impulses = rolling(body, at.free, at.before, at.cos_p, at.sin_p, floor, at.limits)
+    return rolls, moved(motion, at, after, dt), impulses
+
+
+@block
+def slide(
+    body: Body,
+    motion: Motion,
+    contact: Contact,
+    floor: Floor,
+    push: Push,
+    torque_l: float,
+    torque_r: float,
+    dt: float,
+) -> tuple[Motion, Contact]:
+    """A substep by sweeps, right whatever the wheels do."""
+    at = setting(body, motion, contact, floor, push, torque_l, torque_r, dt)
+    after, impulses = sweep(body, at.free, contact, at.cos_p, at.sin_p, floor, at.limits)
+    return moved(motion, at, after, dt), impulses
+
+
+@block
+def substep(
+    body: Body,
+    motion: Motion,
+    contact: Contact,
+    floor: Floor,
+    push: Push,
+    torque_l: float,
+    torque_r: float,
+    dt: float,
+) -> tuple[Motion, Contact]:
+    """Velocities after one substep; the pose is left to :func:`tlf_env.physics.state.advance_pose`.
+
+    Torques in mN·mm, ``dt`` in s. Fork and wheel angles are advanced here with the new rates.
+    """
+    rolls, after, impulses = roll(body, motion, contact, floor, push, torque_l, torque_r, dt)
+    if rolls:
+        return after, impulses
+    return slide(body, motion, contact, floor, push, torque_l, torque_r, dt)

@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-import math
-
 from tlf_env.numerics.compiled import law
+from tlf_env.numerics.trig import sincos
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Motion
 
@@ -22,16 +21,16 @@ def follow_wheels(
     """Eqs (1) and (14) over one substep, by the midpoint rule about c; the castor trails along."""
     u_1 = 0.5 * body.R * (omega_l + omega_r) + delta_1
     u_2 = 0.5 * body.R / body.h * (omega_r - omega_l) + delta_2
-    x = motion.x - body.d * math.sin(motion.theta)
-    y = motion.y + body.d * math.cos(motion.theta)
-    middle = motion.theta + 0.5 * dt * u_2
-    x -= dt * u_1 * math.sin(middle)
-    y += dt * u_1 * math.cos(middle)
+    sin, cos = sincos(motion.theta)
+    x, y = motion.x - body.d * sin, motion.y + body.d * cos
+    sin, cos = sincos(motion.theta + 0.5 * dt * u_2)
+    x -= dt * u_1 * sin
+    y += dt * u_1 * cos
     theta = motion.theta + dt * u_2
-    sin, cos = math.sin(theta), math.cos(theta)
+    sin, cos = sincos(theta)
     # The fork turns so that its wheel rolls: its axle sees no velocity along itself.
-    phi = motion.psi - motion.theta
-    s = -(u_2 * (body.q + body.d) * math.cos(phi) + u_1 * math.sin(phi)) / body.T
+    sin_phi, cos_phi = sincos(motion.psi - motion.theta)
+    s = -(u_2 * (body.q + body.d) * cos_phi + u_1 * sin_phi) / body.T
     return Motion(
         x + body.d * sin,
         y - body.d * cos,

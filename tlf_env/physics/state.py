@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.trig import sincos
 from tlf_env.physics.parameters import Body
 
 
@@ -91,7 +91,8 @@ def conveyor(delta_1: float, delta_2: float, half_width: float) -> tuple[float, 
 @law
 def forward_and_yaw(motion: Motion) -> tuple[float, float]:
     """Speed along the heading (mm/s), the same for every point of the robot's axis, and yaw rate (rad/s)."""
-    return motion.v_y * math.cos(motion.theta) - motion.v_x * math.sin(motion.theta), motion.w
+    sin, cos = sincos(motion.theta)
+    return motion.v_y * cos - motion.v_x * sin, motion.w
 
 
 @law
@@ -117,4 +118,5 @@ def advance_pose(motion: Motion, dt: float) -> Motion:
 @law
 def axle_midpoint(motion: Motion, d: float) -> tuple[float, float]:
     """Position of c, mm: the centre of mass lies ``d`` behind it."""
-    return motion.x - d * math.sin(motion.theta), motion.y + d * math.cos(motion.theta)
+    sin, cos = sincos(motion.theta)
+    return motion.x - d * sin, motion.y + d * cos

@@ -2,7 +2,7 @@
 
 One control step runs, for every robot and substep, wheel loop → torques → disturbances → plant →
 sensors → EKF, and then once per robot radio → observer → observation, reward, errors. Robots do not
-act on each other within a control step unless they touch, so each runs its substeps by itself; the
+act on each other within a control step unless they touch, so the substeps of all run side by side; the
 pymunk plant calls :func:`actuate` and :func:`sense` one substep at a time while robots are close.
 """
 
@@ -11,16 +11,9 @@ from __future__ import annotations
 import numpy as np
 
 from tlf_env.numerics.compiled import block, driver, law
-from tlf_env.onboard.estimator import read_ekf, read_estimate, write_estimate
 from tlf_env.onboard.observer import Message
-from tlf_env.onboard.slip_estimator import (
-    read_slip_ekf,
-    read_slip_estimate,
-    write_slip_estimate,
-)
-from tlf_env.onboard.wheel_loop import read_loop_state, read_wheel_loop, write_loop_state
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
-from tlf_env.physics.state import read_body, read_contact, read_motion, write_contact, write_motion
+from tlf_env.physics.state import read_body
 from tlf_env.task.actions import (
     FULL_RESIDUAL_MM_S,
     FULL_RESIDUAL_RAD_S,
@@ -39,12 +32,6 @@ from tlf_env.task.arrays import (
     RUNNING,
     Arrays,
     Variants,
-    read_effects,
-    read_sensors,
-    read_trace,
-    write_sample,
-    write_sensors,
-    write_trace,
 )
 from tlf_env.task.channels import STEP_CHANNELS, SUBSTEP_CHANNELS
 from tlf_env.task.judging import (
@@ -59,16 +46,11 @@ from tlf_env.task.outlines import mark_touched, room_to_move
 from tlf_env.task.radio import broadcast, delayed_message, next_reference
 from tlf_env.task.settings import Settings
 from tlf_env.task.starting import STARTED, fill, start_lane
-from tlf_env.task.substeps import (
-    EXTERNAL_TORQUE,
-    actuate_robot,
-    delays,
-    evaluate,
-    move_lane,
-    sense_robot,
-)
+from tlf_env.task.substeps import delays, evaluate
+from tlf_env.task.tiles import advance
 
 DONE, MUST_COLLIDE, MUST_SUBSTEP = -1, -2, -3
+FIRST_LANE = np.zeros(1, dtype=np.int64)
 LANES_AT_ONCE = 16  # whose arrays stay in the processor's cache during a step
 
 
@@ -224,71 +206,21 @@ def are_near(a: Arrays, lane: int, s: Settings) -> bool:
 @driver
 def actuate(a: Arrays, lane: int, k: int, s: Settings) -> None:
     """The first half of substep ``k`` of a lane: everything up to the plant's new velocities and poses."""
-    tick = a.clock[lane, 0]
-    for r in range(a.motions.shape[1]):
-        kind = a.kinds[r, lane]
-        if s.external_wheel_loop and kind != TORQUE:
-            kind = EXTERNAL_TORQUE
-        if s.changing:
-            evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, tick, s)
-        dead, hold = delays(a, lane, r, s.dt)
-        wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
-        if k < hold and kind != EXTERNAL_TORQUE:
-            wanted_l, wanted_r = a.wanted_before[0, r, lane], a.wanted_before[1, r, lane]
-        motion, contact, held, trace = actuate_robot(
-            read_body(a.bodies, r, lane),
-            read_wheel_loop(a.wheel_loops, r, lane),
-            read_effects(a.applied, r, lane),
-            read_motion(a.motions, r, lane),
-            read_contact(a.contacts, r, lane),
-            read_loop_state(a.loop_states, r, lane),
-            read_sensors(a.sensors, r, lane),
-            read_trace(a.traces, r, lane),
-            kind,
-            wanted_l,
-            wanted_r,
-            a.patches[a.variants[lane]],
-            a.torques[:, :, r, lane],
-            dead,
-            tick + 1,
-            s.kinematic,
-            s.dt,
-        )
-        write_motion(a.motions, r, lane, motion)
-        write_contact(a.contacts, r, lane, contact)
-        write_loop_state(a.loop_states, r, lane, held)
-        write_trace(a.traces, r, lane, trace)
+    advance(a, np.full(1, lane), k, k + 1, True, False, s)
 
 
 @driver
 def sense(a: Arrays, lane: int, k: int, s: Settings) -> None:
     """The second half of substep ``k`` of a lane: sensors and estimator, and which outlines meet."""
-    tick = a.clock[lane, 0] + 1
-    for r in range(a.motions.shape[1]):
-        sensors, estimate, slip, trace, sample = sense_robot(
-            read_body(a.bodies, r, lane),
-            read_ekf(a.ekfs, r, lane),
-            read_slip_ekf(a.slip_ekfs, r, lane),
-            read_effects(a.applied, r, lane),
-            read_motion(a.motions, r, lane),
-            read_sensors(a.sensors, r, lane),
-            read_estimate(a.estimates, r, lane),
-            read_slip_estimate(a.slip_estimates, r, lane),
-            read_trace(a.traces, r, lane),
-            a.seeds[lane],
-            a.clock[lane, 2],
-            r,
-            tick,
-            s.estimator,
-            s.dt,
-        )
-        write_sample(a.samples[k], r, lane, sample)
-        write_sensors(a.sensors, r, lane, sensors)
-        write_estimate(a.estimates, r, lane, estimate)
-        write_slip_estimate(a.slip_estimates, r, lane, slip)
-        write_trace(a.traces, r, lane, trace)
-    a.clock[lane, 0] = tick
+    advance(a, np.full(1, lane), k, k + 1, False, True, s)
     mark_touched(a, lane)
+
+
+@block
+def mark_all_touched(a: Arrays, lanes: np.ndarray) -> None:
+    """:func:`mark_touched` of some lanes."""
+    for i in range(lanes.shape[0]):
+        mark_touched(a, lanes[i])
 
 
 @driver
@@ -303,17 +235,33 @@ def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
     bad = first_bad_action(a, first, last)
     if bad != DONE:
         return bad
+    apart_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
+    close_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
     for start in range(first, last, LANES_AT_ONCE):
         end = min(start + LANES_AT_ONCE, last)
         for lane in range(start, end):
             take_actions(a, lane, s)
+        apart = close = 0
         for lane in range(start, end):
             near = are_near(a, lane, s)
             if near and s.collides:
                 return MUST_COLLIDE
             if s.has_parts:
                 return MUST_SUBSTEP
-            move_lane(a, lane, near, s)
+            if near:
+                close_lanes[close], close = lane, close + 1
+            else:
+                apart_lanes[apart], apart = lane, apart + 1
+        lanes = apart_lanes[:apart]
+        advance(a, lanes, 0, s.substeps, True, True, s)
+        if s.kinematic:
+            mark_all_touched(a, lanes)
+        # Robots pass through each other here. While they are close, each substep asks which outlines
+        # meet, so that the first touch is marked where a plant with contact marks it.
+        lanes = close_lanes[:close]
+        for k in range(s.substeps if close > 0 else 0):
+            advance(a, lanes, k, k + 1, True, True, s)
+            mark_all_touched(a, lanes)
         for lane in range(start, end):
             conclude_lane(a, lane, s)
     return DONE

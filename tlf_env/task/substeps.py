@@ -1,76 +1,36 @@
-"""The substeps of a control step: wheel loop → torques → disturbances → plant → sensors → EKF.
+"""The laws of a substep around the plant: torques, disturbances, encoders, position fix, and their sums.
 
-Robots do not act on each other within a control step unless they touch, so each runs its substeps by
-itself, everything in registers.
+Wheel loop → torques → disturbances → plant → sensors → EKF; :mod:`tlf_env.task.tiles` runs them.
 """
 
 from __future__ import annotations
 
-import math
+from typing import NamedTuple
 
 import numpy as np
 
 from tlf_env.numerics.compiled import block, law
 from tlf_env.numerics.philox import normal_pair
-from tlf_env.onboard.estimator import (
-    Ekf,
-    Estimate,
-    correct,
-    odometry,
-    predict,
-    read_ekf,
-    read_estimate,
-    write_estimate,
-)
+from tlf_env.onboard.estimator import Ekf, Estimate, correct, odometry, predict
 from tlf_env.onboard.slip_estimator import (
     SlipEkf,
     SlipEstimate,
     correct_with_slip,
     predict_with_slip,
-    read_slip_ekf,
-    read_slip_estimate,
-    write_slip_estimate,
 )
 from tlf_env.onboard.tracking import body_errors
-from tlf_env.onboard.wheel_loop import (
-    WheelLoop,
-    WheelLoopState,
-    read_loop_state,
-    read_wheel_loop,
-    wheel_torque,
-    write_loop_state,
-)
-from tlf_env.physics.kernel import substep
-from tlf_env.physics.kinematics import follow_wheels
+from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState, wheel_torque
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import (
     Contact,
     Floor,
     Motion,
-    Push,
-    advance_pose,
     axle_midpoint,
     conveyor,
     forward_and_yaw,
-    read_body,
-    read_contact,
-    read_motion,
-    write_contact,
-    write_motion,
 )
 from tlf_env.task.actions import TORQUE
-from tlf_env.task.arrays import (
-    Arrays,
-    Sample,
-    Sensors,
-    Trace,
-    read_effects,
-    read_sensors,
-    read_trace,
-    write_sample,
-    write_sensors,
-    write_trace,
-)
+from tlf_env.task.arrays import Arrays, Sample, Sensors, Trace
 from tlf_env.task.channels import (
     CHANNELS,
     COMPUTING_DELAY,
@@ -78,10 +38,8 @@ from tlf_env.task.channels import (
     ENCODER_NOISE,
     FIRST_CHANNEL_STREAM,
     POSITION_NOISE,
-    SUBSTEP_CHANNELS,
 )
-from tlf_env.task.disturbance import Effects, wheel_factors
-from tlf_env.task.outlines import mark_touched
+from tlf_env.task.disturbance import Effects
 from tlf_env.task.settings import EKF, EKF_SLIP, TRUTH, Settings
 from tlf_env.task.signals import SignalRow, signal_value
 
@@ -89,82 +47,137 @@ EXTERNAL_TORQUE = 4  # stands for the kind of a robot whose wheel loop is an obj
 NOMINALS = np.array([channel.nominal for channel in CHANNELS])
 LOWS = np.array([channel.low for channel in CHANNELS])
 HIGHS = np.array([channel.high for channel in CHANNELS])
-NO_PUSH = Push(0.0, 0.0, 0.0)
+
+
+class Order(NamedTuple):
+    """What one robot is asked for during a control step: rad/s, or mN·mm for torques."""
+
+    kind: float  # of action
+    wanted_l: float
+    wanted_r: float
+    before_l: float  # what holds during the first ``hold`` substeps
+    before_r: float
+    hold: float
+    dead: float  # dead time of the torques, substeps
+
+
+class Drive(NamedTuple):
+    """Torques of one substep (mN·mm), and the factors on the tyres' friction."""
+
+    asked_l: float  # by the wheel loop or the action, within the motor's limit
+    asked_r: float
+    given_l: float  # delivered
+    given_r: float
+    grip_l: float
+    grip_r: float
+    grip_c: float
+
+
+class Reading(NamedTuple):
+    """What the encoders show, rad."""
+
+    left: float
+    right: float
+
+
+class Draw(NamedTuple):
+    """Whose random number it is, and when; see :func:`tlf_env.numerics.philox.words`."""
+
+    seed: int
+    robot: int
+    episode: int
+    tick: int
 
 
 @law
-def actuate_robot(
-    body: Body,
-    loop: WheelLoop,
-    effects: Effects,
-    motion: Motion,
-    contact: Contact,
-    held: WheelLoopState,
-    sensors: Sensors,
-    trace: Trace,
-    kind: int,
-    wanted_l: float,
-    wanted_r: float,
-    patches: np.ndarray,
-    delayed: np.ndarray,
-    dead: int,
-    tick: int,
-    kinematic: bool,
-    dt: float,
-) -> tuple[Motion, Contact, WheelLoopState, Trace]:
-    """Wheel loop, torques, disturbances and plant for one substep of one robot."""
-    if kinematic:
-        moved = follow_wheels(
-            body, motion, wanted_l, wanted_r, effects.delta_1, effects.delta_2, dt
-        )
-        return moved, contact, held, trace
-    limit = body.torque_limit
-    if kind in (TORQUE, EXTERNAL_TORQUE):
-        torque_l = min(max(wanted_l, -limit), limit)
-        torque_r = min(max(wanted_r, -limit), limit)
-    else:
-        torque_l, integral_l, lag_l = wheel_torque(
-            wanted_l - sensors.speed_l, held.integral_l, held.lag_l, loop, limit
-        )
-        torque_r, integral_r, lag_r = wheel_torque(
-            wanted_r - sensors.speed_r, held.integral_r, held.lag_r, loop, limit
-        )
-        held = WheelLoopState(integral_l, lag_l, integral_r, lag_r)
-    belt_l, belt_r = conveyor(effects.delta_1, effects.delta_2, body.h)
-    floor = Floor(belt_l, belt_r, effects.grip, effects.grip, effects.grip)
-    if patches.shape[0] > 0:
-        on_l, on_r, on_c = wheel_factors(patches, body, motion)
-        floor = Floor(belt_l, belt_r, effects.grip * on_l, effects.grip * on_r, effects.grip * on_c)
-    given_l, given_r = torque_l, torque_r
-    slots = delayed.shape[1]
-    if slots > 1:
-        delayed[0, tick % slots], delayed[1, tick % slots] = torque_l, torque_r
-        given_l, given_r = 0.0, 0.0
-        if tick > dead:
-            given_l, given_r = delayed[0, (tick - dead) % slots], delayed[1, (tick - dead) % slots]
-    given_l *= effects.gain_l
-    given_r *= effects.gain_r
-    motion, contact = substep(body, motion, contact, floor, NO_PUSH, given_l, given_r, dt)
-    at_limit = abs(torque_l) >= limit or abs(torque_r) >= limit
+def wanted(order: Order, k: int) -> tuple[float, float]:
+    """What holds in substep ``k`` of the control step."""
+    early = k < order.hold
     return (
-        advance_pose(motion, dt),
-        contact,
-        held,
-        Trace(
-            trace.distance,
-            trace.turn,
-            trace.innovation_forward,
-            trace.innovation_right,
-            trace.nis,
-            trace.torque_l + given_l,
-            trace.torque_r + given_r,
-            trace.saturated + (1.0 if at_limit else 0.0),
-            max(trace.slip, max(contact.slip_l, contact.slip_r)),
-            trace.slid + 0.5 * (contact.slip_l + contact.slip_r) * dt,
-            trace.torque_2 + given_l * given_l + given_r * given_r,
-            trace.work
-            + (max(given_l * motion.omega_l, 0.0) + max(given_r * motion.omega_r, 0.0)) * dt,
-        ),
+        order.before_l if early else order.wanted_l,
+        order.before_r if early else order.wanted_r,
+    )
+
+
+@law
+def asked_torques(
+    body: Body, loop: WheelLoop, order: Order, held: WheelLoopState, sensors: Sensors, k: int
+) -> tuple[float, float, WheelLoopState]:
+    """Torques asked for in substep ``k``, within the motors' limit, and what the wheel loops hold then."""
+    limit = body.torque_limit
+    wanted_l, wanted_r = wanted(order, k)
+    if order.kind == TORQUE or order.kind == EXTERNAL_TORQUE:
+        return min(max(wanted_l, -limit), limit), min(max(wanted_r, -limit), limit), held
+    torque_l, integral_l, lag_l = wheel_torque(
+        wanted_l - sensors.speed_l, held.integral_l, held.lag_l, loop, limit
+    )
+    torque_r, integral_r, lag_r = wheel_torque(
+        wanted_r - sensors.speed_r, held.integral_r, held.lag_r, loop, limit
+    )
+    return torque_l, torque_r, WheelLoopState(integral_l, lag_l, integral_r, lag_r)
+
+
+@law
+def undisturbed(asked_l: float, asked_r: float, effects: Effects) -> Drive:
+    """Torques delivered without dead time, on a floor without patches."""
+    return Drive(
+        asked_l,
+        asked_r,
+        asked_l * effects.gain_l,
+        asked_r * effects.gain_r,
+        effects.grip,
+        effects.grip,
+        effects.grip,
+    )
+
+
+@law
+def floor_under(body: Body, effects: Effects, drive: Drive) -> Floor:
+    """What the floor does to a robot during one substep."""
+    belt_l, belt_r = conveyor(effects.delta_1, effects.delta_2, body.h)
+    return Floor(belt_l, belt_r, drive.grip_l, drive.grip_r, drive.grip_c)
+
+
+@law
+def trace_drive(
+    trace: Trace, limit: float, drive: Drive, motion: Motion, contact: Contact, dt: float
+) -> Trace:
+    """Sums and extremes of torque and slip, one substep on."""
+    at_limit = abs(drive.asked_l) >= limit or abs(drive.asked_r) >= limit
+    given_l, given_r = drive.given_l, drive.given_r
+    return Trace(
+        trace.distance,
+        trace.turn,
+        trace.innovation_forward,
+        trace.innovation_right,
+        trace.nis,
+        trace.torque_l + given_l,
+        trace.torque_r + given_r,
+        trace.saturated + (1.0 if at_limit else 0.0),
+        max(trace.slip, max(contact.slip_l, contact.slip_r)),
+        trace.slid + 0.5 * (contact.slip_l + contact.slip_r) * dt,
+        trace.torque_2 + given_l * given_l + given_r * given_r,
+        trace.work + (max(given_l * motion.omega_l, 0.0) + max(given_r * motion.omega_r, 0.0)) * dt,
+    )
+
+
+@law
+def disturbed_reading(angle: float, noise: float, effects: Effects) -> float:
+    """An encoder's reading (rad) with noise (standard normal) and resolution."""
+    if effects.encoder_std > 0.0:
+        angle += effects.encoder_std * noise
+    if effects.quantum > 0.0:
+        angle = effects.quantum * np.floor(angle / effects.quantum)
+    return angle
+
+
+@law
+def disturbed_encoders(motion: Motion, effects: Effects, draw: Draw) -> Reading:
+    """Both encoders with noise and resolution."""
+    noise_l, noise_r = normal_pair(draw.seed, ENCODER_NOISE, draw.robot, draw.episode, draw.tick)
+    return Reading(
+        disturbed_reading(motion.angle_l, noise_l, effects),
+        disturbed_reading(motion.angle_r, noise_r, effects),
     )
 
 
@@ -175,33 +188,24 @@ def sense_robot(
     slip_ekf: SlipEkf,
     effects: Effects,
     motion: Motion,
+    reading: Reading,
     sensors: Sensors,
     estimate: Estimate,
     slip: SlipEstimate,
     trace: Trace,
-    seed: int,
-    episode: int,
-    robot: int,
-    tick: int,
+    draw: Draw,
     kind: int,
     dt: float,
 ) -> tuple[Sensors, Estimate, SlipEstimate, Trace, Sample]:
-    """Encoders, position fix and estimator (of the ``kind``) after substep ``tick`` of one robot."""
-    read_l, read_r = motion.angle_l, motion.angle_r
-    if effects.encoder_std > 0.0:
-        noise_l, noise_r = normal_pair(seed, ENCODER_NOISE, robot, episode, tick)
-        read_l += effects.encoder_std * noise_l
-        read_r += effects.encoder_std * noise_r
-    if effects.quantum > 0.0:
-        read_l = effects.quantum * math.floor(read_l / effects.quantum)
-        read_r = effects.quantum * math.floor(read_r / effects.quantum)
-    step_l, step_r = read_l - sensors.encoder_l, read_r - sensors.encoder_r
+    """Position fix and estimator (of the ``kind``) after a substep of one robot."""
+    step_l, step_r = reading.left - sensors.encoder_l, reading.right - sensors.encoder_r
     u_1, u_2 = odometry(step_l, step_r, body.R, body.h)
-    x, y = axle_midpoint(motion, body.d)
-    x += effects.bias_x
-    y += effects.bias_y
+    true_x, true_y = axle_midpoint(motion, body.d)
+    x, y = true_x + effects.bias_x, true_y + effects.bias_y
     if effects.fix_std > 0.0:
-        noise_x, noise_y = normal_pair(seed, POSITION_NOISE, robot, episode, tick)
+        noise_x, noise_y = normal_pair(
+            draw.seed, POSITION_NOISE, draw.robot, draw.episode, draw.tick
+        )
         x += effects.fix_std * noise_x
         y += effects.fix_std * noise_y
     d_x = d_y = nis = 0.0
@@ -211,7 +215,6 @@ def sense_robot(
         estimate, slip = predict_with_slip(estimate, slip, slip_ekf, u_1, u_2, dt)
         estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y)
     elif kind == TRUTH:
-        true_x, true_y = axle_midpoint(motion, body.d)
         ahead, yaw = forward_and_yaw(motion)
         rolled, spun = odometry(motion.omega_l, motion.omega_r, body.R, body.h)
         certain = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
@@ -219,7 +222,7 @@ def sense_robot(
         estimate = Estimate(true_x, true_y, motion.theta, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     forward, right = body_errors(d_x, d_y, estimate.theta)
     return (
-        Sensors(read_l, read_r, step_l / dt, step_r / dt),
+        Sensors(reading.left, reading.right, step_l / dt, step_r / dt),
         estimate,
         slip,
         Trace(
@@ -268,95 +271,3 @@ def evaluate(a: Arrays, lane: int, r: int, first: int, last: int, tick: int, s: 
         if s.adversary and not np.isnan(a.imposed[c, r, lane]):
             value = a.imposed[c, r, lane]
         a.applied[c, r, lane] = value
-
-
-@block
-def advance(a: Arrays, lane: int, begin: int, end: int, s: Settings) -> None:
-    """Run the substeps ``begin`` to before ``end`` of every robot of a lane, each by itself."""
-    dt = s.dt
-    seed, episode, first = a.seeds[lane], a.clock[lane, 2], a.clock[lane, 0] - begin
-    patches = a.patches[a.variants[lane]]
-    for r in range(a.motions.shape[1]):
-        body = read_body(a.bodies, r, lane)
-        loop = read_wheel_loop(a.wheel_loops, r, lane)
-        ekf = read_ekf(a.ekfs, r, lane)
-        slip_ekf = read_slip_ekf(a.slip_ekfs, r, lane)
-        effects = read_effects(a.applied, r, lane)
-        motion = read_motion(a.motions, r, lane)
-        contact = read_contact(a.contacts, r, lane)
-        held = read_loop_state(a.loop_states, r, lane)
-        sensors = read_sensors(a.sensors, r, lane)
-        estimate = read_estimate(a.estimates, r, lane)
-        slip = read_slip_estimate(a.slip_estimates, r, lane)
-        trace = read_trace(a.traces, r, lane)
-        kind = a.kinds[r, lane]
-        wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
-        dead, hold = delays(a, lane, r, dt)
-        if begin < hold:
-            wanted_l, wanted_r = a.wanted_before[0, r, lane], a.wanted_before[1, r, lane]
-        delayed = a.torques[:, :, r, lane]
-        for k in range(begin, end):
-            if s.changing:
-                evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, first + k, s)
-                effects = read_effects(a.applied, r, lane)
-            if k == hold:
-                wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
-            motion, contact, held, trace = actuate_robot(
-                body,
-                loop,
-                effects,
-                motion,
-                contact,
-                held,
-                sensors,
-                trace,
-                kind,
-                wanted_l,
-                wanted_r,
-                patches,
-                delayed,
-                dead,
-                first + k + 1,
-                s.kinematic,
-                dt,
-            )
-            sensors, estimate, slip, trace, sample = sense_robot(
-                body,
-                ekf,
-                slip_ekf,
-                effects,
-                motion,
-                sensors,
-                estimate,
-                slip,
-                trace,
-                seed,
-                episode,
-                r,
-                first + k + 1,
-                s.estimator,
-                dt,
-            )
-            write_sample(a.samples[k], r, lane, sample)
-        write_motion(a.motions, r, lane, motion)
-        write_contact(a.contacts, r, lane, contact)
-        write_loop_state(a.loop_states, r, lane, held)
-        write_sensors(a.sensors, r, lane, sensors)
-        write_estimate(a.estimates, r, lane, estimate)
-        write_slip_estimate(a.slip_estimates, r, lane, slip)
-        write_trace(a.traces, r, lane, trace)
-    a.clock[lane, 0] = first + end
-
-
-@block
-def move_lane(a: Arrays, lane: int, near: bool, s: Settings) -> None:
-    """Run the substeps of a control step of a lane without contact: robots pass through each other.
-
-    While they are ``near``, each substep asks which outlines meet, so that the first touch is marked
-    where a plant with contact marks it.
-    """
-    at_once = 1 if near else s.substeps
-    for begin in range(0, s.substeps, at_once):
-        advance(a, lane, begin, begin + at_once, s)
-        if near or s.kinematic:
-            mark_touched(a, lane)
