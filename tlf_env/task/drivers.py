@@ -171,9 +171,9 @@ def delays_of(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
 def start(
     a: Arrays, of: Variants, mask: np.ndarray, poses: np.ndarray, s: Settings
 ) -> tuple[int, int, int]:
-    """:func:`start_lane` of every lane of the mask, up to the first that fails.
+    """:func:`start_lane` of every lane of the mask, up to the first that fails; :func:`look` is next.
 
-    Returns its result and the lane. :func:`look` comes after it.
+    Returns its result and the lane.
     """
     for lane in range(mask.shape[0]):
         if mask[lane]:
@@ -293,17 +293,17 @@ def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
     bad = first_bad_action(a, first, last)
     if bad != DONE:
         return bad
-    for start in range(first, last, LANES_AT_ONCE):
-        end = min(start + LANES_AT_ONCE, last)
-        for lane in range(start, end):
+    for begin in range(first, last, LANES_AT_ONCE):
+        end = min(begin + LANES_AT_ONCE, last)
+        for lane in range(begin, end):
             take_actions(a, lane, s)
-        for lane in range(start, end):
+        for lane in range(begin, end):
             near = are_near(a, lane, s)
             if near and s.collides:
                 return MUST_COLLIDE
             if s.has_parts:
                 return MUST_SUBSTEP
             move_lane(a, lane, near, s)
-        for lane in range(start, end):
+        for lane in range(begin, end):
             conclude_lane(a, lane, s)
     return DONE
