@@ -160,9 +160,9 @@ def delays_of(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
 def start(
     a: Arrays, of: Variants, mask: np.ndarray, poses: np.ndarray, s: Settings
 ) -> tuple[int, int, int]:
-    """:func:`start_lane` of every lane of the mask, up to the first that fails.
+    """:func:`start_lane` of every lane of the mask, up to the first that fails; :func:`look` is next.
 
-    Returns its result and the lane. :func:`look` comes after it.
+    Returns its result and the lane.
     """
     for lane in range(mask.shape[0]):
         if mask[lane]:
@@ -237,31 +237,16 @@ def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
         return bad
     apart_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
     close_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
-    for start in range(first, last, LANES_AT_ONCE):
-        end = min(start + LANES_AT_ONCE, last)
-        for lane in range(start, end):
+    for begin in range(first, last, LANES_AT_ONCE):
+        end = min(begin + LANES_AT_ONCE, last)
+        for lane in range(begin, end):
             take_actions(a, lane, s)
         apart = close = 0
-        for lane in range(start, end):
+        for lane in range(begin, end):
             near = are_near(a, lane, s)
             if near and s.collides:
                 return MUST_COLLIDE
             if s.has_parts:
                 return MUST_SUBSTEP
-            if near:
-                close_lanes[close], close = lane, close + 1
-            else:
-                apart_lanes[apart], apart = lane, apart + 1
-        lanes = apart_lanes[:apart]
-        advance(a, lanes, 0, s.substeps, True, True, s)
-        if s.kinematic:
-            mark_all_touched(a, lanes)
-        # Robots pass through each other here. While they are close, each substep asks which outlines
-        # meet, so that the first touch is marked where a plant with contact marks it.
-        lanes = close_lanes[:close]
-        for k in range(s.substeps if close > 0 else 0):
-            advance(a, lanes, k, k + 1, True, True, s)
-            mark_all_touched(a, lanes)
-        for lane in range(start, end):
             conclude_lane(a, lane, s)
     return DONE
