@@ -50,5 +50,6 @@ for _task in ("infinity", "flower"):
     gymnasium.register(
         f"tlf_env/{_task.capitalize()}-v0",
         "tlf_env.envs.single:FormationEnv",
+        vector_entry_point="tlf_env.envs.vector:FormationVectorEnv",
         kwargs={"scenario": _task},
     )

@@ -101,7 +101,7 @@ class BatchPlant:
             for a seed out of its range, a mask of another shape, or a formation that cannot start; in
             the last case the formations of the mask have to be reset again.
         """
-        a, k = self.arrays, np.arange(self.formations)
+        a = self.arrays
         chosen = self._checked_mask(mask)
         fresh = chosen & ~self._seeded if seed is None else chosen
         if fresh.any():
@@ -112,10 +112,18 @@ class BatchPlant:
         a.clock[chosen & ~fresh, 2] += 1
         a.clock[fresh, 2] = 0
         self._seeded |= chosen
+        self._start(chosen)
+
+    def restart(self, mask: np.ndarray) -> None:
+        """Start the present episode of the formations of the mask, ``(formations,)`` bool, over again."""
+        self._start(self._checked_mask(mask))
+
+    def _start(self, chosen: np.ndarray) -> None:
+        a = self.arrays
         result, robot, lane = drivers.start(a, self._variants, chosen, NO_POSES, self._settings)
         if result != STARTED:
             why = refusal(a, self._variants, result, robot, lane)
-            raise ValueError(f"formation {k[lane]}: {why}")
+            raise ValueError(f"formation {lane}: {why}")
         drivers.look(a, chosen, True, self._settings)
 
     def reset_finished(self) -> np.ndarray:

@@ -1,0 +1,147 @@
+"""stable-baselines3 on the batch plant. Skipped where it is not installed (``make test-learning`` has it)."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("stable_baselines3")
+
+from stable_baselines3 import PPO
+from stable_baselines3.common.callbacks import EvalCallback
+from stable_baselines3.common.evaluation import evaluate_policy
+from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNormalize
+
+import tlf_env
+from baselines.sb3 import FormationVecEnv
+
+SHORT = {"horizon_s": 2.0, "time_gap_s": 1.0, "preview_s": (0.5,)}
+ROUGH = {**SHORT, "disturbance": "combined-hard", "lost_beyond_mm": 150.0}
+SMALL = {"n_steps": 32, "batch_size": 96, "n_epochs": 2, "device": "cpu"}
+
+
+def environment(formations: int = 4, **changes) -> FormationVecEnv:
+    return FormationVecEnv("infinity", formations, **{**ROUGH, **changes})
+
+
+def actions(rows: int, steps: int) -> np.ndarray:
+    return np.random.default_rng(3).uniform(-0.5, 0.5, (steps, rows, 2)).astype(np.float32)
+
+
+def test_every_robot_is_that_of_the_parallel_environment():
+    """Observations, rewards, ends and what ended them, over several episodes of each formation."""
+    env = environment(3)
+    env.seed(11)
+    seen = env.reset()
+    alone = [tlf_env.parallel_env("infinity", plant="batch", **ROUGH) for _ in range(3)]
+    theirs = [one.reset(seed=11 + k)[0] for k, one in enumerate(alone)]
+    ended = 0
+    for action in actions(9, 300):
+        assert np.array_equal(seen, np.concatenate([list(obs.values()) for obs in theirs]))
+        seen, rewards, dones, infos = env.step(action)
+        for k, one in enumerate(alone):
+            agents = list(one.agents)
+            given = dict(zip(agents, action[3 * k : 3 * k + 3], strict=True))
+            theirs[k], reward, terminated, truncated, info = one.step(given)
+            for i, agent in enumerate(agents):
+                row = 3 * k + i
+                assert rewards[row] == np.float32(reward[agent])
+                assert dones[row] == (terminated[agent] or truncated[agent])
+                if dones[row]:
+                    assert infos[row]["TimeLimit.truncated"] == truncated[agent]
+                    assert infos[row]["end"] == info[agent]["end"]
+                    assert np.array_equal(infos[row]["terminal_observation"], theirs[k][agent])
+                else:
+                    assert infos[row] == {}
+            if not one.agents:
+                ended += 1
+                theirs[k] = one.reset()[0]
+    assert ended > 9
+
+
+def test_tasks_of_different_size_share_one_environment():
+    tasks = {
+        "infinity": ["infinity", {**tlf_env.load_scenario("infinity").model_dump(), "name": "x"}],
+        "flower": "flower",
+    }
+    env = FormationVecEnv(tasks, 5, mixture=False, horizon_s=2.0)
+    assert env.num_envs == 3 * 3 + 2 * 5
+    assert env.place(0) == (0, 0, 0)
+    assert env.place(8) == (0, 2, 2)
+    assert env.place(9) == (1, 0, 0)
+    assert env.place(18) == (1, 1, 4)
+    assert env.seed(5) == [5] * 3 + [6] * 3 + [7] * 3 + [8] * 5 + [9] * 5
+    seen = env.reset()
+    alone = tlf_env.parallel_env("flower", plant="batch", horizon_s=2.0)
+    assert np.array_equal(seen[9:14], np.stack(list(alone.reset(seed=8)[0].values())))
+    assert env.get_attr("scenario", [9])[0].name == "flower"
+
+
+def test_the_interface_of_vec_env():
+    env = environment(2)
+    env.seed(0)
+    env.reset()
+    assert env.get_attr("render_mode") == [None] * 6
+    assert [place.robot for place in env.get_attr("place")] == [0, 1, 2, 0, 1, 2]
+    env.set_attr("colour", "red", [1, 2])
+    assert env.get_attr("colour", [1, 2]) == ["red", "red"]
+    with pytest.raises(AttributeError, match="no attribute 'colour'"):
+        env.get_attr("colour", 0)
+    assert len(env.env_method("state")) == 6
+    assert env.env_method("state", indices=4)[0].shape == (12,)
+    assert env.env_is_wrapped(VecMonitor) == [False] * 6
+    with pytest.raises(ValueError, match=r"\(6, 2\) finite numbers"):
+        env.step(np.full((6, 2), np.nan))
+    with pytest.raises(ValueError, match=r"\(6, 2\) finite numbers"):
+        env.step(np.zeros((5, 2)))
+
+
+def weights(seed: int) -> list[np.ndarray]:
+    model = PPO("MlpPolicy", environment(), seed=seed, **SMALL)
+    model.learn(600)
+    return [tensor.detach().numpy().copy() for tensor in model.policy.parameters()]
+
+
+def test_the_same_seed_gives_the_same_weights():
+    one, same, other = weights(3), weights(3), weights(4)
+    assert all(np.array_equal(a, b) for a, b in zip(one, same, strict=True))
+    assert not all(np.array_equal(a, b) for a, b in zip(one, other, strict=True))
+
+
+class Constant(VecEnvWrapper):
+    """A reward of 1 in every step."""
+
+    def reset(self):
+        return self.venv.reset()
+
+    def step_wait(self):
+        seen, rewards, dones, infos = self.venv.step_wait()
+        return seen, np.ones_like(rewards), dones, infos
+
+
+def test_truncation_is_bootstrapped():
+    """A reward of 1 for ever is worth 1/(1 − γ), however short the episodes are cut."""
+    gamma = 0.9
+    env = Constant(environment(16, lost_beyond_mm=1e6, horizon_s=1.0, end_on=()))
+    settings = {**SMALL, "batch_size": 256, "n_epochs": 10, "n_steps": 64, "learning_rate": 3e-3}
+    model = PPO("MlpPolicy", env, gamma=gamma, seed=0, **settings)
+    model.learn(16 * 3 * 64 * 20)
+    seen = env.reset()
+    values = model.policy.predict_values(model.policy.obs_to_tensor(seen)[0]).detach().numpy()
+    assert values.mean() == pytest.approx(1 / (1 - gamma), rel=0.05)
+
+
+def test_normalise_monitor_and_evaluate(tmp_path):
+    env = VecNormalize(VecMonitor(environment()), norm_reward=True)
+    test = VecNormalize(VecMonitor(environment(2)), training=False, norm_reward=False)
+    model = PPO("MlpPolicy", env, seed=0, **SMALL)
+    callback = EvalCallback(
+        test, n_eval_episodes=6, eval_freq=32, log_path=str(tmp_path), verbose=0
+    )
+    model.learn(800, callback=callback)
+    found = np.load(tmp_path / "evaluations.npz")
+    assert found["results"].shape[1] == 6
+    assert (found["ep_lengths"] <= 100).all()
+    assert len(model.ep_info_buffer) > 0
+    mean, _ = evaluate_policy(model, env, n_eval_episodes=4)
+    assert np.isfinite(mean)

@@ -1,0 +1,222 @@
+"""Gymnasium's vector environment on the batch plant: one learner in each of many formations."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+from gymnasium.vector import AutoresetMode, VectorEnv
+from gymnasium.vector.utils import batch_space
+
+from tlf_env.envs.parallel import start_options
+from tlf_env.envs.single import BY_REFERENCE
+from tlf_env.task.actions import ACTION_SIZE, REFERENCE
+from tlf_env.task.arrays import END_REASONS, Info
+from tlf_env.task.batch import BatchPlant
+from tlf_env.task.channels import PATHS
+from tlf_env.task.observation import OBSERVATION_LIMIT
+from tlf_env.task.reward import RewardTerms
+from tlf_env.task.scenario import Scenario
+
+RESET_MASK = "reset_mask"
+
+
+class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+    """Many formations with one learner each; the reference drives the other robots.
+
+    Sub-environment k seeded s is :class:`~tlf_env.envs.single.FormationEnv` seeded s + k, bit for bit,
+    until two robots touch. Without ``render``: make one environment for pictures.
+
+    Parameters
+    ----------
+    scenario
+        As :class:`~tlf_env.task.batch.BatchPlant` takes it: one, or a sequence that the formations share.
+    num_envs
+        How many formations.
+    learner
+        The agent that acts in each; as in :class:`~tlf_env.envs.single.FormationEnv`.
+    others
+        ``"reference"`` alone: a policy in Python would be called once per robot.
+    threads
+        How many work on a step; None takes one for each core.
+    mixture
+        Whether every episode draws its scenario, or with what shares.
+    autoreset_mode
+        ``NextStep`` (Gymnasium's default), ``SameStep`` or ``Disabled``.
+    render_mode
+        None.
+    **overrides
+        Fields of the scenarios; ``disturbance_level`` too.
+
+    Raises
+    ------
+    ValueError
+        for an unknown learner, mode, key or value, in one line.
+    """
+
+    def __init__(
+        self,
+        scenario: str | Path | Mapping[str, Any] | Scenario | Sequence[Any] = "infinity",
+        num_envs: int = 1,
+        *,
+        learner: str | None = None,
+        others: str = BY_REFERENCE,
+        threads: int | None = 1,
+        mixture: bool | Sequence[float] = False,
+        autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
+        render_mode: str | None = None,
+        **overrides: Any,
+    ) -> None:
+        self.plant = BatchPlant(scenario, num_envs, threads=threads, mixture=mixture, **overrides)
+        self.scenario = self.plant.scenario
+        robots = self.scenario.robot_count
+        agents = [f"robot_{i}" for i in range(robots)]
+        learner = agents[min(1, robots - 1)] if learner is None else learner
+        if learner not in agents:
+            raise ValueError(f"learner {learner!r} is not one of {', '.join(agents)}")
+        if others != BY_REFERENCE:
+            raise ValueError(f"others {others!r} must be {BY_REFERENCE!r} in a vector environment")
+        if render_mode is not None:
+            raise ValueError(f"render_mode {render_mode!r} must be None in a vector environment")
+        try:
+            self.autoreset_mode = AutoresetMode(autoreset_mode)
+        except ValueError as error:
+            modes = ", ".join(mode.value for mode in AutoresetMode)
+            raise ValueError(f"autoreset_mode {autoreset_mode!r} is not one of {modes}") from error
+        self.learner = learner
+        self._robot = agents.index(learner)
+        self.plant.arrays.kinds[[i for i in range(robots) if i != self._robot]] = REFERENCE
+        self.num_envs = self.plant.formations
+        self.metadata = {
+            "render_modes": [],
+            "render_fps": 1 / self.scenario.control_period_s,
+            "autoreset_mode": self.autoreset_mode,
+        }
+        dtype = np.dtype(self.scenario.dtype)
+        shape = self.plant.observations.shape[2:]
+        self.single_observation_space = gymnasium.spaces.Box(
+            -OBSERVATION_LIMIT, OBSERVATION_LIMIT, shape, dtype.type
+        )
+        self.single_action_space = gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), dtype.type)
+        self.observation_space = batch_space(self.single_observation_space, self.num_envs)
+        self.action_space = batch_space(self.single_action_space, self.num_envs)
+        self._actions = np.zeros((self.num_envs, robots, ACTION_SIZE))
+        self._over = np.zeros(self.num_envs, dtype=np.bool_)  # ended, and not begun again
+
+    def reset(
+        self,
+        *,
+        seed: int | Sequence[int] | None = None,
+        options: dict[str, Any] | None = None,
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Start an episode in all formations, or in those of ``options["reset_mask"]``.
+
+        ``seed`` gives sub-environment k ``seed`` + k, or ``seed[k]``; without one its next episode
+        begins. Other options are the single environment's and have to be given there.
+
+        Raises
+        ------
+        ValueError
+            for a seed out of its range, a mask of another shape, or an option that does not exist here.
+        """
+        options = dict(options or {})
+        mask = options.pop(RESET_MASK, None)
+        start_options(options, self.scenario.robot_count)
+        if options:
+            raise ValueError(
+                f"reset option {next(iter(options))!r} does not exist in a vector environment; there "
+                f"is {RESET_MASK}"
+            )
+        begun = self._begun(mask) if seed is None else np.zeros_like(self._over)
+        if begun.any():  # its next episode has begun already
+            self.plant.restart(begun)
+            mask = ~begun if mask is None else mask & ~begun
+        self.plant.reset(seed, mask)
+        self._over &= ~(np.ones_like(begun) if mask is None else mask | begun)
+        return self._observations(), self._infos()
+
+    def step(
+        self, actions: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
+        """Advance all formations by one control period; ``actions`` is ``(num_envs, 2)``.
+
+        A formation that ended is begun again as ``autoreset_mode`` says. With ``NextStep`` its next
+        action is ignored, and that step gives the first observation and a reward of 0.
+
+        Raises
+        ------
+        ValueError
+            for actions of another shape or not finite, naming the sub-environment; nothing has changed.
+        RuntimeError
+            before the first reset, or in mode ``Disabled`` if a formation ended and was not reset.
+        """
+        given = np.asarray(actions)
+        if given.shape != self._actions[:, self._robot].shape:
+            raise ValueError(
+                f"actions must have the shape {self._actions[:, self._robot].shape}, got {given.shape}"
+            )
+        if self._over.any() and self.autoreset_mode is AutoresetMode.DISABLED:
+            raise RuntimeError(
+                f"sub-environment {np.flatnonzero(self._over)[0]} ended: reset() it before step()"
+            )
+        self._actions[:, self._robot] = given
+        begun = self._over.copy()
+        self.plant.step(self._actions)
+        if begun.any():  # they have been started, and stand at their start again
+            self.plant.restart(begun)
+        rewards = np.where(begun, 0.0, self.plant.rewards[:, self._robot])
+        terminated = self.plant.terminated[:, self._robot] & ~begun
+        truncated = self.plant.truncated[:, self._robot] & ~begun
+        self._over = terminated | truncated
+        observations, infos = self._observations(), self._infos()
+        if self._over.any() and self.autoreset_mode is not AutoresetMode.DISABLED:
+            self.plant.reset(mask=self._over)
+            if self.autoreset_mode is AutoresetMode.SAME_STEP:
+                infos = self._final(observations, infos)
+                observations = self._observations()
+                self._over[:] = False
+        return observations, rewards, terminated, truncated, infos
+
+    def _begun(self, mask: np.ndarray | None) -> np.ndarray:
+        """The formations of the mask that ended and have been started again for the next step."""
+        if self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+            return np.zeros_like(self._over)
+        return self._over if mask is None else self._over & mask
+
+    def _final(self, observations: np.ndarray, infos: dict[str, Any]) -> dict[str, Any]:
+        """The infos of the new episodes, with what the ended ones left."""
+        last = np.full(self.num_envs, None, dtype=object)
+        for k in np.flatnonzero(self._over):
+            last[k] = observations[k]
+        fresh = self._infos()
+        fresh |= {"final_obs": last, "_final_obs": self._over.copy()}
+        fresh |= {"final_info": infos, "_final_info": self._over.copy()}
+        return fresh
+
+    def _observations(self) -> np.ndarray:
+        return self.plant.observations[:, self._robot].copy()
+
+    def _infos(self) -> dict[str, Any]:
+        """Gymnasium's form: an array over the sub-environments for each key, and a mask ``_key``."""
+        p, r = self.plant, self._robot
+        everywhere = np.ones(self.num_envs, dtype=np.bool_)
+
+        def columns(names: Sequence[str], rows: np.ndarray) -> dict[str, Any]:
+            table = rows.T.copy()
+            named: dict[str, Any] = dict(zip(names, table, strict=True))
+            return named | {f"_{name}": everywhere for name in names}
+
+        infos = columns(Info._fields, p.infos[:, r])
+        infos["reward"] = columns(RewardTerms._fields, p.terms[:, r])
+        infos["disturbance"] = columns(PATHS, p.applied[:, r])
+        infos |= {"lost": p.lost[:, r].copy(), "touched": p.touched[:, r].copy()}
+        infos |= {"end": np.array(END_REASONS)[p.ends[:, r]], "_end": p.ends[:, r] != 0}
+        return infos | {
+            f"_{name}": everywhere for name in ("reward", "disturbance", "lost", "touched")
+        }
+
+    def close_extras(self, **kwargs: Any) -> None:
+        """Nothing is open."""
