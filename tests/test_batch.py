@@ -182,7 +182,7 @@ def test_seeds_may_be_any_and_a_run_without_one_draws_its_own():
 @pytest.mark.parametrize("end_on", [("lost", "touched"), ("lost",), ()])
 def test_ends_are_those_of_the_environment(end_on):
     options = {**SHORT, **CROWDED, "end_on": end_on, "lost_beyond_mm": 260.0, "plant": "batch"}
-    plant = BatchPlant("infinity", 6, **options)
+    plant = BatchPlant("infinity", 12, **options)
     plant.reset(0)
     env = tlf_env.parallel_env("infinity", **options)
     steps = [
@@ -190,7 +190,7 @@ def test_ends_are_those_of_the_environment(end_on):
         for _ in range(200)
     ]
     reasons = set()
-    for k in range(6):
+    for k in range(12):
         observations, _ = env.reset(seed=k)
         for _, terminated, truncated, ends in steps:
             rows = POLICY.predict(np.stack(list(observations.values())))[0]

@@ -248,5 +248,20 @@ def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
                 return MUST_COLLIDE
             if s.has_parts:
                 return MUST_SUBSTEP
+            if near:
+                close_lanes[close], close = lane, close + 1
+            else:
+                apart_lanes[apart], apart = lane, apart + 1
+        lanes = apart_lanes[:apart]
+        advance(a, lanes, 0, s.substeps, True, True, s)
+        if s.kinematic:
+            mark_all_touched(a, lanes)
+        # Robots pass through each other here. While they are close, each substep asks which outlines
+        # meet, so that the first touch is marked where a plant with contact marks it.
+        lanes = close_lanes[:close]
+        for k in range(s.substeps if close > 0 else 0):
+            advance(a, lanes, k, k + 1, True, True, s)
+            mark_all_touched(a, lanes)
+        for lane in range(begin, end):
             conclude_lane(a, lane, s)
     return DONE
