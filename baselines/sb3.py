@@ -126,7 +126,7 @@ class FormationVecEnv(VecEnv):
             plant.reset(None if self._seed is None else self._seed + int(first))
         self._seed = None
         self._reset_seeds()
-        self.reset_infos = [{} for _ in range(self.num_envs)]
+        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         return self._observations()
 
     def step_async(self, actions: np.ndarray) -> None:
