@@ -243,7 +243,9 @@ def test_the_scenario_sets_the_filters_numbers():
         "infinity", physics_period_s=0.002, ekf_slip={"fix_variance_mm2": 1.5}, horizon_s=1.0
     )
     expected = slip_ekf_constants(SlipEkfParameters(fix_variance_mm2=1.5), 0.002)
-    found = Formation(scenario).arrays.slip_ekfs
+    formation = Formation(scenario)
+    formation.reset(0)
+    found = formation.arrays.slip_ekfs
     np.testing.assert_array_equal(found, np.tile(np.array(expected)[:, None, None], (1, 3, 1)))
     with pytest.raises(ValueError, match=r"ekf_slip.*fix_variance_mm2"):
         load_scenario("infinity", ekf_slip={"fix_variance_mm2": 0.0})

@@ -8,6 +8,11 @@ import pytest
 import tlf_env
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.estimator import read_ekf, read_estimate, write_estimate
+from tlf_env.onboard.slip_estimator import (
+    read_slip_ekf,
+    read_slip_estimate,
+    write_slip_estimate,
+)
 from tlf_env.onboard.wheel_loop import read_loop_state, read_wheel_loop, write_loop_state
 from tlf_env.physics.kernel import substep
 from tlf_env.physics.state import (
@@ -24,6 +29,7 @@ from tlf_env.task.actions import TWIST
 from tlf_env.task.arrays import (
     Arrays,
     make_arrays,
+    make_variants,
     read_effects,
     read_sensors,
     read_trace,
@@ -60,6 +66,7 @@ SCENARIOS: list[dict[str, Any]] = [
     {"disturbance": "nominal"},
     {"disturbance": "none", "estimator": "truth"},
     {"disturbance": "combined-hard"},
+    {"disturbance": "combined-hard", "estimator": "ekf-slip"},
     {"disturbance": "nominal", "action": "torque"},
     {"disturbance": EVERYTHING},
     {"disturbance": CHANGING},
@@ -73,8 +80,9 @@ def thrown_about(lanes: int, seed: int = 0, **overrides: Any) -> tuple[Arrays, S
     table = reference_table(scenario)
     a, s = make_arrays([scenario], table, lanes), settings(scenario)
     a.seeds[:] = seed + np.arange(lanes)
-    drivers.start(a, np.ones(lanes, dtype=np.bool_), np.zeros((0, 3)), s)
-    drivers.look(a, np.ones(lanes, dtype=np.bool_), True, s)
+    everyone = np.ones(lanes, dtype=np.bool_)
+    drivers.start(a, make_variants([scenario]), everyone, np.zeros((0, 3)), s)
+    drivers.look(a, everyone, True, s)
     for lane in range(lanes):
         rng = np.random.default_rng(1000 * seed + lane)
         robots = a.motions.shape[1]
@@ -134,10 +142,11 @@ def one_by_one(a: Arrays, s: Settings) -> None:
     push = Push(0.0, 0.0, 0.0)
     for lane in range(a.motions.shape[2]):
         for r in range(a.motions.shape[1]):
-            body, loop, ekf = (
+            body, loop, ekf, slip_ekf = (
                 read_body(a.bodies, r, lane),
                 read_wheel_loop(a.wheel_loops, r, lane),
                 read_ekf(a.ekfs, r, lane),
+                read_slip_ekf(a.slip_ekfs, r, lane),
             )
             wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
             order = Order(float(TWIST), wanted_l, wanted_r, 0.0, 0.0, 0.0, 0.0)
@@ -166,14 +175,16 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                 )
                 motion = advance_pose(motion, s.dt)
                 draw = Draw(a.seeds[lane], r, a.clock[lane, 2], tick + 1)
-                sensors, estimate, trace, sample = sense_robot(
+                sensors, estimate, slip, trace, sample = sense_robot(
                     body,
                     ekf,
+                    slip_ekf,
                     effects,
                     motion,
                     disturbed_encoders(motion, effects, draw),
                     sensors,
                     read_estimate(a.estimates, r, lane),
+                    read_slip_estimate(a.slip_estimates, r, lane),
                     trace,
                     draw,
                     s.estimator,
@@ -184,6 +195,7 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                 write_loop_state(a.loop_states, r, lane, held)
                 write_sensors(a.sensors, r, lane, sensors)
                 write_estimate(a.estimates, r, lane, estimate)
+                write_slip_estimate(a.slip_estimates, r, lane, slip)
                 write_trace(a.traces, r, lane, trace)
                 write_sample(a.samples[k], r, lane, sample)
         a.clock[lane, 0] += s.substeps
@@ -194,12 +206,15 @@ def in_tiles(a: Arrays, lanes: np.ndarray, s: Settings) -> None:
     advance(a, lanes, 0, s.substeps, True, True, s)
 
 
+@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip"])
 @pytest.mark.parametrize("disturbance", ["none", "combined-hard", CHANGING], ids=str)
-def test_a_tile_gives_the_bits_of_the_laws_run_one_by_one(disturbance):
+def test_a_tile_gives_the_bits_of_the_laws_run_one_by_one(disturbance, estimator):
     lanes = WIDTH + 3
     rng = np.random.default_rng(5)
     commands = rng.uniform(-10, 10, (2, 3, lanes))
-    (a, s), (b, _) = (thrown_about(lanes, disturbance=disturbance) for _ in range(2))
+    (a, s), (b, _) = (
+        thrown_about(lanes, disturbance=disturbance, estimator=estimator) for _ in range(2)
+    )
     a.commands[:] = b.commands[:] = commands
     for _ in range(5):
         one_by_one(a, s)

@@ -32,9 +32,10 @@ def disc(
     """
     if radius <= 0.0:
         return 0.0, 0.0, math.inf
-    inverse = 1.0 / (w_ee * w_ff - w_ef * w_ef)
-    p_e = (w_ef * b_f - w_ff * b_e) * inverse
-    p_f = (w_ef * b_e - w_ee * b_f) * inverse
+    # Divided by, not multiplied with its inverse: a robot at rest shows the last digit.
+    det = w_ee * w_ff - w_ef * w_ef
+    p_e = (w_ef * b_f - w_ff * b_e) / det
+    p_f = (w_ef * b_e - w_ee * b_f) / det
     square = p_e * p_e + p_f * p_f
     if square <= radius * radius:
         return p_e, p_f, 0.0
