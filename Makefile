@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow check format speed constraints clean
+.PHONY: help run test test-slow test-learning check format speed constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -23,6 +23,9 @@ test: check ## Check, then run the tests
 
 test-slow: $(VENV)/.stamp-test ## Run the long tests
 	$(BIN)/pytest -m slow
+
+test-learning: $(VENV)/.stamp-train ## Run what needs stable-baselines3 and torch
+	$(BIN)/pytest tests/test_sb3.py tests/test_learned.py tests/test_examples.py tests/test_gymnasium.py
 
 check: $(VENV)/.stamp-test ## Lint, check the format and the types
 	$(BIN)/ruff check
@@ -67,4 +70,8 @@ $(VENV)/.stamp-run: $(VENV)/.stamp-venv pyproject.toml constraints.txt
 # mpe2 is named alone: the extra `peers` would bring vmas, and vmas brings torch.
 $(VENV)/.stamp-test: $(VENV)/.stamp-run
 	$(PIP) -c constraints.txt -e ".[figures,view,bench,dev]" mpe2
+	@touch $@
+
+$(VENV)/.stamp-train: $(VENV)/.stamp-test
+	$(PIP) -c constraints.txt -e ".[train]"
 	@touch $@

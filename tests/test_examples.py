@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import tlf_env
-from baselines import ReferencePolicy
+from baselines import ReferencePolicy, load_policy
 from tlf_env.envs.single import FormationEnv
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -84,9 +84,10 @@ def test_the_design_prints_margins(
 def test_training_runs_and_saves(
     example: ModuleType, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    example.main(steps=64, episodes=1, horizon_s=5.0, out=tmp_path / "follower.zip")
+    out = tmp_path / "follower.safetensors"
+    example.main(robot_steps=400, formations=4, horizon_s=5.0, out=out)
     assert "reference" in capsys.readouterr().out
-    assert (tmp_path / "follower.zip").exists()
+    assert load_policy(out).card.residual_base == "tuned"
 
 
 # What the parts of the examples are worth, on the whole task
