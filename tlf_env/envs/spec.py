@@ -128,17 +128,19 @@ on its trajectory the leader's reference starts. `state()` is the truth, for cri
 
 ## Many formations
 
-All on the batch plant (`tlf_env.BatchPlant`, [architecture.md](architecture.md#many-formations)): robots pass
-through each other, `touched` is told all the same, and every number is that of single environments, bit for bit.
+All on the batch plant (`tlf_env.BatchPlant`, [architecture.md](architecture.md#many-formations)): robots
+pass through each other, `touched` is told all the same, and every number is that of single environments, bit
+for bit.
 
-- `gymnasium.make_vec("tlf_env/Infinity-v0", num_envs=256, vectorization_mode="vector_entry_point", learner="robot_1",
-  autoreset_mode="NextStep", threads=1, **fields)`: one learner in each formation, the reference drives the others.
-  Sub-environment k seeded s is `gymnasium.make(..., plant="batch")` seeded s + k. Modes `NextStep`, `SameStep`
-  (`final_obs`, `final_info`) and `Disabled` (`reset(options={"reset_mask": mask})`) are Gymnasium's.
-- `baselines.sb3.FormationVecEnv("infinity", formations=256, threads=1, **fields)`: stable-baselines3's `VecEnv`, every
-  robot a sub-environment, robot i of formation k at k·n + i. `terminal_observation` and `TimeLimit.truncated` say
-  where to bootstrap: robots that another one's end cut off are truncated. Several tasks, of any number of
-  robots: `FormationVecEnv({"infinity": [...], "flower": "flower"})`.
+- `gymnasium.make_vec("tlf_env/Infinity-v0", num_envs=256, vectorization_mode="vector_entry_point",
+  learner="robot_1", autoreset_mode="NextStep", threads=1, **fields)`: one learner in each formation, the
+  reference drives the others. Sub-environment k seeded s is `gymnasium.make(..., plant="batch")` seeded
+  s + k. The modes `NextStep`, `SameStep` (`final_obs`, `final_info`) and `Disabled`
+  (`reset(options={"reset_mask": mask})`) are Gymnasium's.
+- `baselines.sb3.FormationVecEnv("infinity", formations=256, threads=1, **fields)`: stable-baselines3's
+  `VecEnv`, every robot a sub-environment, robot i of formation k at k·n + i. `terminal_observation` and
+  `TimeLimit.truncated` say where to bootstrap: robots that another one's end cut off are truncated. Several
+  tasks, of any number of robots: `FormationVecEnv({"infinity": [...], "flower": "flower"})`.
 - A sequence of scenarios with `mixture=True` or shares draws one for every episode: domain randomisation.
 """
 
