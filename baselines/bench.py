@@ -24,10 +24,11 @@ from typing import Any, NamedTuple
 
 from baselines.learned import LearnedPolicy
 from baselines.policies import enter
-from baselines.run import Policy, Record, run_policy, run_seeds, versions
+from baselines.run import Record, run_policy, run_seeds, versions
 from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.files import atomic
 from tlf_env.numerics.philox import checked_seed
+from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario, preset_names, presets_folder
 
 RUNS, PLAN = "runs.jsonl", "plan.json"

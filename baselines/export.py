@@ -12,7 +12,8 @@ import numpy as np
 
 from baselines.card import WEIGHTS, Card, Network, write_policy
 from baselines.learned import load_policy
-from baselines.run import Policy, versions
+from baselines.run import versions
+from tlf_env.onboard.parts import Policy
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario

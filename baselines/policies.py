@@ -10,8 +10,7 @@ from baselines.card import WEIGHTS
 from baselines.classical import FeedbackLinearisation, PurePursuit
 from baselines.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.reference import ReferencePolicy
-from baselines.run import Policy
-from tlf_env.onboard.parts import load_part
+from tlf_env.onboard.parts import Policy, load_part
 from tlf_env.onboard.tracking import CONTROLLERS
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import tracking_entries

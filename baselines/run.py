@@ -8,13 +8,13 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 
 from tlf_env.numerics.files import atomic
 from tlf_env.numerics.philox import checked_seed
-from tlf_env.onboard.parts import Factory
+from tlf_env.onboard.parts import Factory, Policy
 from tlf_env.physics.state import Motion
 from tlf_env.task.arrays import Arrays, Info
 from tlf_env.task.batch import BatchPlant
@@ -23,19 +23,6 @@ from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, str
 from tlf_env.task.scenario import Scenario
 
 REPORTED_PACKAGES = ("tlf-env", "numpy", "numba", "gymnasium", "pettingzoo", "pymunk")
-
-
-class Policy(Protocol):
-    """Whatever acts: the signature of SB3's ``predict``."""
-
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = True,
-    ) -> tuple[np.ndarray, Any]:
-        """Actions for a batch of observations, and the next state."""
 
 
 # Columns of a record, in the order of trajectory.csv; each is (time, robot).
@@ -66,27 +53,7 @@ RECORDED = (
     "slid_mm",
     "innovation_nis",
 )
-FROM_INFO = (
-    "x_mm",
-    "y_mm",
-    "theta_rad",
-    "reference_x_mm",
-    "reference_y_mm",
-    "reference_theta_rad",
-    "position_error_mm",
-    "formation_error_mm",
-    "heading_error_rad",
-    "time_gap_error_s",
-    "torque_l_Nmm",
-    "torque_r_Nmm",
-    "torque_rms_Nmm",
-    "energy_mJ",
-    "saturation_fraction",
-    "slip_mm_s",
-    "slid_mm",
-    "innovation_nis",
-)
-
+FROM_INFO = tuple(name for name in RECORDED if name in Info._fields)
 FROM_WHEELS = (
     "castor_rad",
     "omega_l_rad_s",

@@ -4,31 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Protocol, cast
+from typing import Any, cast
 
 import gymnasium
 import numpy as np
 
 from tlf_env.envs.parallel import RENDER_MODES, FormationParallelEnv
 from tlf_env.envs.spec import documented
-from tlf_env.onboard.parts import load_part
+from tlf_env.onboard.parts import Policy, load_part
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE, TWIST
 from tlf_env.task.scenario import Scenario
 
 BY_REFERENCE = "reference"
-
-
-class Predicts(Protocol):
-    """Whatever drives: the signature of SB3's ``predict``."""
-
-    def predict(
-        self,
-        observation: np.ndarray,
-        state: Any = None,
-        episode_start: np.ndarray | None = None,
-        deterministic: bool = True,
-    ) -> tuple[np.ndarray, Any]:
-        """Actions for a batch of observations, and the next state."""
 
 
 @documented
@@ -69,7 +56,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         scenario: str | Path | Mapping[str, Any] | Scenario = "infinity",
         *,
         learner: str | None = None,
-        others: str | Predicts = BY_REFERENCE,
+        others: str | Policy = BY_REFERENCE,
         render_mode: str | None = None,
         **overrides: Any,
     ) -> None:
@@ -95,7 +82,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         }
 
     @staticmethod
-    def _make_driver(others: str | Predicts) -> Predicts | None:
+    def _make_driver(others: str | Policy) -> Policy | None:
         if others == BY_REFERENCE:
             return None
         driver: Any = others
@@ -107,7 +94,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             driver = load_part(others)()
         if isinstance(driver, type) or not hasattr(driver, "predict"):
             raise ValueError(f"others {driver!r} has no predict()")
-        return cast(Predicts, driver)
+        return cast(Policy, driver)
 
     @property
     def scenario(self) -> Scenario:

@@ -90,14 +90,20 @@ def predict(e: Estimate, ekf: Ekf, u_1: float, u_2: float) -> Estimate:
 
 
 @law
+def certainty(e: Estimate, variance: float) -> tuple[float, float, float]:
+    """S⁻¹ of eq. (39), upper triangle in mm⁻²: how sure the filter is of the next fix."""
+    s_xx, s_xy, s_yy = e.p_xx + variance, e.p_xy, e.p_yy + variance
+    det = s_xx * s_yy - s_xy * s_xy
+    return s_yy / det, -s_xy / det, s_xx / det
+
+
+@law
 def correct(e: Estimate, ekf: Ekf, x: float, y: float) -> tuple[Estimate, float, float, float]:
     """Eqs (31), (39)–(41) with a position fix (mm).
 
     Returns the estimate, the innovation in world axes (mm), and its normalised square (NIS).
     """
-    s_xx, s_xy, s_yy = e.p_xx + ekf.variance, e.p_xy, e.p_yy + ekf.variance
-    det = s_xx * s_yy - s_xy * s_xy
-    i_xx, i_xy, i_yy = s_yy / det, -s_xy / det, s_xx / det
+    i_xx, i_xy, i_yy = certainty(e, ekf.variance)
     d_x, d_y = x - e.x, y - e.y
     # Gain l = P Hᵀ S⁻¹, rows x, y, θ.
     l_xx, l_xy = e.p_xx * i_xx + e.p_xy * i_xy, e.p_xx * i_xy + e.p_xy * i_yy

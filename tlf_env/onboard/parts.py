@@ -54,6 +54,19 @@ class Observer(Protocol):
         """The reference for time ``t_s`` given the delayed message for that time."""
 
 
+class Policy(Protocol):
+    """Whatever acts: the signature of SB3's ``predict``."""
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """Actions for a batch of observations, and the next state."""
+
+
 def load_part(path: str) -> Factory:
     """The object that ``"module:factory"`` names; modules beside the working directory are found too.
 

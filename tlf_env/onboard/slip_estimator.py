@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law, reader, writer
 from tlf_env.numerics.trig import sincos
-from tlf_env.onboard.estimator import Estimate
+from tlf_env.onboard.estimator import Estimate, certainty
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
 
@@ -142,9 +142,7 @@ def correct_with_slip(
 
     Returns the estimates, the innovation in world axes (mm), and its normalised square (NIS).
     """
-    s_xx, s_xy, s_yy = e.p_xx + ekf.variance, e.p_xy, e.p_yy + ekf.variance
-    det = s_xx * s_yy - s_xy * s_xy
-    i_xx, i_xy, i_yy = s_yy / det, -s_xy / det, s_xx / det
+    i_xx, i_xy, i_yy = certainty(e, ekf.variance)
     d_x, d_y = x - e.x, y - e.y
     # Gain l = P Hᵀ S⁻¹, rows x, y, θ, δ₁, δ₂.
     l_xx, l_xy = e.p_xx * i_xx + e.p_xy * i_xy, e.p_xx * i_xy + e.p_xy * i_yy
