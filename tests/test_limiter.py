@@ -18,7 +18,7 @@ from tlf_env.onboard.limiter import (
     TwistLimits,
     limited_twist,
     limits_row,
-    saturated_error,
+    saturated,
 )
 from tlf_env.onboard.tracking import (
     CONTROLLERS,
@@ -62,10 +62,10 @@ def batch(rows: int = 64, seed: int = 0) -> np.ndarray:
 
 
 @untimed
-@given(twists, twists, slips)
-def test_without_limits_the_twist_is_left_bit_for_bit(u, last, slip):
-    assert limited_twist(*u, *last, *slip, NONE) == u
-    assert saturated_error(u[0], NONE) == u[0]
+@given(twists, twists, slips, speeds)
+def test_without_limits_the_twist_is_left_bit_for_bit(u, last, slip, cruise):
+    assert limited_twist(*u, *last, *slip, cruise, NONE) == u
+    assert saturated(u[0], NONE.forward_error) == u[0]
 
 
 @pytest.mark.parametrize("name", PAPERS)
@@ -84,10 +84,10 @@ def test_without_limits_the_policy_is_the_papers_law_bit_for_bit(name):
 
 
 @untimed
-@given(twists, twists, slips)
-def test_limits_hold(u, last, slip):
-    """Of the body's twist, the wheels' plus the slip; turning gives way before the speed."""
-    v_1, v_2 = limited_twist(*u, *last, *slip, ALL)
+@given(twists, twists, slips, speeds)
+def test_limits_hold(u, last, slip, cruise):
+    """Of the body's twist, the wheels' plus the slip."""
+    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
     b_1, b_2 = v_1 + slip[0], v_2 + slip[1]
     assert abs(v_1 - last[0]) <= ALL.step_1 + 1e-9
     assert abs(b_1 * b_2) <= ALL.lateral * (1 + 1e-9) + 1e-9
@@ -97,40 +97,56 @@ def test_limits_hold(u, last, slip):
 
 
 @untimed
-@given(twists, twists, slips)
-def test_limiting_a_limited_twist_changes_nothing(u, last, slip):
-    v_1, v_2 = limited_twist(*u, *last, *slip, ALL)
-    again = limited_twist(v_1 + slip[0], v_2 + slip[1], *last, *slip, ALL)
+@given(twists, twists, slips, speeds)
+def test_catching_up_gives_way_before_turning_and_turning_before_the_references_speed(
+    u, last, slip, cruise
+):
+    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
+    unlimited = TUNED.model_copy(update={"lateral_acceleration_mm_s2": None})
+    w_1, w_2 = limited_twist(*u, *last, *slip, cruise, limits_row(unlimited, PERIOD_S))
+    fastest_brake = abs(last[0] + slip[0]) - ALL.step_1
+    if abs(v_1 + slip[0]) < abs(w_1 + slip[0]) - 1e-9:  # slower, and no more than it had to be
+        assert abs(v_1 + slip[0]) >= abs(cruise) - 1e-9
+    if abs(v_2 + slip[1]) < abs(w_2 + slip[1]) - 1e-9:  # turning gave way, for speed could not
+        assert abs(v_1 + slip[0]) <= max(abs(cruise), fastest_brake) + 1e-9
+
+
+@untimed
+@given(twists, twists, slips, speeds)
+def test_limiting_a_limited_twist_changes_nothing(u, last, slip, cruise):
+    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
+    again = limited_twist(v_1 + slip[0], v_2 + slip[1], *last, *slip, cruise, ALL)
     assert again == pytest.approx((v_1, v_2), rel=1e-12, abs=1e-9)
 
 
 @untimed
-@given(st.floats(-100, 100), st.floats(-0.4, 0.4), slips)
-def test_what_is_within_the_limits_is_left_but_for_the_slip(u_1, u_2, slip):
+@given(st.floats(-100, 100), st.floats(-0.4, 0.4), slips, speeds)
+def test_what_is_within_the_limits_is_left_but_for_the_slip(u_1, u_2, slip, cruise):
     last = u_1 - slip[0] + 0.5 * ALL.step_1, u_2 - slip[1] - 0.5 * ALL.step_2
-    assert limited_twist(u_1, u_2, *last, *slip, ALL) == (u_1 - slip[0], u_2 - slip[1])
+    assert limited_twist(u_1, u_2, *last, *slip, cruise, ALL) == (u_1 - slip[0], u_2 - slip[1])
 
 
 @untimed
-@given(twists, twists, slips)
-def test_limits_are_the_same_to_the_left_and_to_the_right_and_back_and_forth(u, last, slip):
-    v_1, v_2 = limited_twist(*u, *last, *slip, ALL)
+@given(twists, twists, slips, speeds)
+def test_limits_are_the_same_to_the_left_and_to_the_right_and_back_and_forth(u, last, slip, cruise):
+    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
     for turn, way in ((-1.0, 1.0), (1.0, -1.0)):
         mirrored = [
             sign * value
             for pair in (u, last, slip)
             for sign, value in zip((way, turn), pair, strict=True)
         ]
-        assert limited_twist(*mirrored, ALL) == (way * v_1, turn * v_2)
+        assert limited_twist(*mirrored, cruise, ALL) == (way * v_1, turn * v_2)
 
 
 @untimed
 @given(st.floats(-5000, 5000), st.floats(-5000, 5000))
 def test_the_forward_error_saturates_smoothly(e, other):
-    assert abs(saturated_error(e, ALL)) <= min(abs(e) + 1e-12, TUNED.forward_error_mm)
-    assert saturated_error(-e, ALL) == -saturated_error(e, ALL)
-    assert (saturated_error(e, ALL) - saturated_error(other, ALL)) * (e - other) >= 0
-    assert saturated_error(1.0, ALL) == pytest.approx(1.0, rel=1e-5)
+    most = ALL.forward_error
+    assert abs(saturated(e, most)) <= min(abs(e) + 1e-12, TUNED.forward_error_mm)
+    assert saturated(-e, most) == -saturated(e, most)
+    assert (saturated(e, most) - saturated(other, most)) * (e - other) >= 0
+    assert saturated(1.0, most) == pytest.approx(1.0, rel=1e-5)
 
 
 def test_limits_on_accelerations_are_per_second():
@@ -241,7 +257,7 @@ def test_without_a_lead_no_preview_is_read():
     rows, other = batch(), batch(seed=1)
     needed = [place(name) for name in READ]
     other[:, needed] = rows[:, needed]
-    policy = ReferencePolicy("tuned")
+    policy = ReferencePolicy(controller("tuned").model_copy(update={"lead_s": 0.0}))
     assert policy.predict(rows)[0].tobytes() == policy.predict(other)[0].tobytes()
     short = np.ascontiguousarray(rows[:, : len(Tracking._fields)])
     assert policy.predict(rows)[0].tobytes() == policy.predict(short)[0].tobytes()

@@ -6,6 +6,7 @@ import pytest
 from baselines.policies import enter, make_policy, policy_names
 from baselines.run import run_policy
 from baselines.stack import StackPolicy
+from tlf_env.onboard.tracking import controller
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import load_scenario
 
@@ -61,12 +62,13 @@ def test_an_estimator_that_is_set_stands(estimator):
 
 def test_the_reference_has_the_scenarios_period():
     """A limit on an acceleration is a step of the command, as long as the period."""
+    fastest = controller("tuned").limits.acceleration_mm_s2
     seen = np.zeros(len(tracking_entries((1.0,))), dtype=np.float64)
     seen[:4] = 1.0, 0.0, 0.0, 1.0  # the reference is far ahead
     for period_s in (0.01, 0.02):
         scenario = load_scenario(control_period_s=period_s, preview_s=(1.0,), estimator="ekf-slip")
         action, _ = make_policy("reference:tuned", scenario).predict(seen)
-        assert action[0] == pytest.approx(150.0 * period_s / 1000.0)
+        assert action[0] == pytest.approx(fastest * period_s / 1000.0)
 
 
 def test_a_residual_is_added_to_the_tuned_reference():

@@ -11,9 +11,11 @@ from helpers import reference_actions, stacked
 import tlf_env
 from baselines import ReferencePolicy
 from tlf_env.onboard.tracking import TrackingGains, gains_row, tracking_gains, tracking_twist
-from tlf_env.task.observation import Tracking
+from tlf_env.task.observation import Tracking, tracking_entries
+from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
 ENTRIES = len(Tracking._fields)
+WHOLE = len(tracking_entries(DEFAULT_PREVIEW_S))
 NEEDED = ("e_1", "e_2", "sin_e_3", "cos_e_3", "reference_u_1", "reference_u_2")
 
 presets = pytest.mark.parametrize("preset", ["consistent", "printed"])
@@ -61,10 +63,10 @@ def test_action_is_the_law_at_the_formations_estimates(preset):
 
 @every
 def test_prediction_is_a_pure_function_of_the_observation(preset):
-    policy, rows = ReferencePolicy(preset), batch()
+    policy, rows = ReferencePolicy(preset), batch(entries=WHOLE)
     kept = rows.copy()
     first, _ = policy.predict(rows)
-    policy.predict(batch(seed=1))
+    policy.predict(batch(entries=WHOLE, seed=1))
     second, _ = policy.predict(rows, episode_start=np.ones(len(rows), dtype=bool))
     fresh, _ = ReferencePolicy(preset).predict(rows, deterministic=False)
     assert first.tobytes() == second.tobytes() == fresh.tobytes()
@@ -73,7 +75,7 @@ def test_prediction_is_a_pure_function_of_the_observation(preset):
 
 @every
 def test_a_batch_is_its_rows_one_by_one(preset):
-    policy, rows = ReferencePolicy(preset), batch()
+    policy, rows = ReferencePolicy(preset), batch(entries=WHOLE)
     together, _ = policy.predict(rows)
     alone = [policy.predict(row)[0] for row in rows]
     assert together.shape == (64, 2)

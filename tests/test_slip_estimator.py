@@ -199,6 +199,9 @@ def test_without_doubt_about_slip_it_is_a_filter_of_the_pose():
     assert set(law[1]) == {0.0}
 
 
+BOUNDS = PRESET.delta_1_bound_mm_s, PRESET.delta_2_bound_rad_s
+
+
 def test_bounds_hold_the_slip_and_leave_the_rest_of_the_estimate():
     rng = np.random.default_rng(4)
     met = 0
@@ -208,11 +211,9 @@ def test_bounds_hold_the_slip_and_leave_the_rest_of_the_estimate():
         fix = tuple(map(float, rng.normal(0, 30, 2)))
         free_e, free_z, *free = correct_with_slip(*start, FREE, *fix)
         e, z, *rest = correct_with_slip(*start, CHOSEN, *fix)
-        assert abs(z.delta_1) <= PRESET.delta_1_bound_mm_s
-        assert abs(z.delta_2) <= PRESET.delta_2_bound_rad_s
         assert (e, z[2:], rest) == (free_e, free_z[2:], free)
-        assert z.delta_1 == np.clip(free_z.delta_1, -60.0, 60.0)
-        assert z.delta_2 == np.clip(free_z.delta_2, -0.4, 0.4)
+        for slip, free_slip, bound in zip(z[:2], free_z[:2], BOUNDS, strict=True):
+            assert slip == np.clip(free_slip, -bound, bound)
         met += z[:2] != free_z[:2]
     assert met > 50
 
@@ -272,7 +273,7 @@ def test_doubt_grows_per_second_and_not_per_sample(dt):
     assert P[1, 3] == pytest.approx(PRESET.delta_1_walk_mm2_s3 / 2, rel=2 * dt)
 
 
-@pytest.mark.parametrize("dt", [0.002, 0.005])
+@pytest.mark.parametrize("dt", [0.0005, 0.002])
 def test_doubt_settles_at_the_same_level_if_fixes_tell_as_much_per_second(dt):
     """Fewer fixes, each better by as much."""
 

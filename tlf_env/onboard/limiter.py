@@ -18,6 +18,7 @@ class TwistLimits(Frozen):
     """None leaves a limit out; without any the law is the paper's."""
 
     forward_error_mm: Positive | None = None  # e₁ enters as E·tanh(e₁/E)
+    lateral_error_mm: Positive | None = None  # e₂ likewise
     acceleration_mm_s2: Positive | None = None  # of u₁
     yaw_acceleration_rad_s2: Positive | None = None  # of u₂
     lateral_acceleration_mm_s2: Positive | None = None  # of |u₁ u₂|
@@ -28,6 +29,7 @@ class Limits(NamedTuple):
     """The same as the compiled law takes them; infinity where there is none."""
 
     forward_error: float
+    lateral_error: float
     step_1: float  # mm/s per control step
     step_2: float  # rad/s per control step
     lateral: float
@@ -42,6 +44,7 @@ def limits_row(limits: TwistLimits, period_s: float) -> Limits:
 
     return Limits(
         finite(limits.forward_error_mm),
+        finite(limits.lateral_error_mm),
         finite(limits.acceleration_mm_s2, period_s),
         finite(limits.yaw_acceleration_rad_s2, period_s),
         finite(limits.lateral_acceleration_mm_s2),
@@ -50,11 +53,11 @@ def limits_row(limits: TwistLimits, period_s: float) -> Limits:
 
 
 @law
-def saturated_error(e_1: float, limits: Limits) -> float:
-    """The forward error as the tracking law gets it, mm."""
-    if limits.forward_error == math.inf:
-        return e_1
-    return limits.forward_error * math.tanh(e_1 / limits.forward_error)
+def saturated(error: float, most: float) -> float:
+    """A position error as the tracking law gets it, at most so large, mm."""
+    if most == math.inf:
+        return error
+    return most * math.tanh(error / most)
 
 
 @law
@@ -71,16 +74,22 @@ def limited_twist(
     last_2: float,
     delta_1: float,
     delta_2: float,
+    cruise: float,
     limits: Limits,
 ) -> tuple[float, float]:
     """Twist for the wheels (mm/s, rad/s) if the body shall have ``u``.
 
-    ``last`` is the wheels' twist of the step before, ``delta`` the estimated slip. Speed goes before
-    turning: where both together are too much, the yaw rate gives way.
+    ``last`` is the wheels' twist of the step before, ``delta`` the estimated slip, ``cruise`` the
+    reference's speed (mm/s). Where speed and yaw rate together are too much, what is beyond the
+    reference's speed gives way first, and then the yaw rate.
     """
     s_1, s_2 = limits.slip * delta_1, limits.slip * delta_2
     b_1 = within(u_1, last_1 + s_1, limits.step_1)
     b_2 = within(u_2, last_2 + s_2, limits.step_2)
+    if abs(b_1 * b_2) > limits.lateral:
+        enough = max(limits.lateral / abs(b_2), abs(cruise))
+        if abs(b_1) > enough:
+            b_1 = within(math.copysign(enough, b_1), last_1 + s_1, limits.step_1)
     if abs(b_1 * b_2) > limits.lateral:
         b_2 = math.copysign(limits.lateral / abs(b_1), b_2)
     return b_1 - s_1, b_2 - s_2

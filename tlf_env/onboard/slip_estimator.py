@@ -18,14 +18,14 @@ from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 class SlipEkfParameters(Frozen):
     """Noise of the filter, and the bounds that its slip estimates are held within."""
 
-    forward_noise_mm2_s: NonNegative = 2.5  # of the position along the heading
-    sideways_noise_mm2_s: NonNegative = 0.33
-    heading_noise_rad2_s: NonNegative = 4e-4
-    delta_1_walk_mm2_s3: NonNegative = 5.7
-    delta_2_walk_rad2_s3: NonNegative = 0.0088
-    fix_variance_mm2: Positive = 4.85
-    delta_1_bound_mm_s: NonNegative = 60.0
-    delta_2_bound_rad_s: NonNegative = 0.4
+    forward_noise_mm2_s: NonNegative = 13.6  # of the position along the heading
+    sideways_noise_mm2_s: NonNegative = 0.75
+    heading_noise_rad2_s: NonNegative = 2.2e-4
+    delta_1_walk_mm2_s3: NonNegative = 206.0
+    delta_2_walk_rad2_s3: NonNegative = 0.0068
+    fix_variance_mm2: Positive = 2.1
+    delta_1_bound_mm_s: NonNegative = 47.0
+    delta_2_bound_rad_s: NonNegative = 0.43
 
 
 class SlipEkf(NamedTuple):

@@ -68,14 +68,18 @@ GAIN_PRESETS: dict[str, TrackingGains] = {
 CONTROLLERS: dict[str, Controller] = {
     **{name: Controller(gains=gains) for name, gains in GAIN_PRESETS.items()},
     "tuned": Controller(
-        gains=TrackingGains(k_1_per_s=0.5, k_2_mm2_s=2.2 * 1.35e5, k_3_mm2=1.35e5),
+        gains=TrackingGains(
+            k_1_per_s=0.55, k_2_mm2_s=6.4 * 1.76e4, k_3_mm2=1.76e4, eta=1e-4, epsilon=0.05
+        ),
         limits=TwistLimits(
-            forward_error_mm=320.0,
-            acceleration_mm_s2=150.0,
-            yaw_acceleration_rad_s2=5.0,
-            lateral_acceleration_mm_s2=185.0,
+            forward_error_mm=440.0,
+            lateral_error_mm=150.0,
+            acceleration_mm_s2=153.0,
+            yaw_acceleration_rad_s2=8.2,
+            lateral_acceleration_mm_s2=177.0,
             cancel_slip=True,
         ),
+        lead_s=0.015,
     ),
 }
 
