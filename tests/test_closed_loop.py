@@ -220,14 +220,14 @@ def test_scattered_starts_lose_the_filter_and_not_the_law():
 # RMS position error of the worst robot in the last 30 %, mm: the largest of seeds 0 to 2. The test
 # allows 1.5 times as much.
 TUNED_RMS_MM = {
-    "nominal": 3.4,
-    "slip": 39.0,
-    "noise": 3.6,
-    "ice": 2.5,
-    "start": 3.4,
-    "combined-hard": 20.3,
-    "radio": 7.8,
-    "actuator": 4.6,
+    "nominal": 0.9,
+    "slip": 28.5,
+    "noise": 4.3,
+    "ice": 0.8,
+    "start": 0.9,
+    "combined-hard": 12.3,
+    "radio": 3.6,
+    "actuator": 1.6,
 }
 
 
@@ -253,6 +253,18 @@ def test_the_tuned_reference_loses_nobody(disturbance, seed):
     assert not lost
     assert not touched
     assert rms_mm <= SLACK * TUNED_RMS_MM[disturbance]
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("task", "own_mm", "formation_mm"), [("infinity", 1.7, 5.0), ("flower", 0.4, 2.0)]
+)
+def test_the_tuned_reference_is_precise_where_nothing_disturbs(task, own_mm, formation_mm, seed):
+    """Worst robot from 40 % of the horizon on."""
+    entry = enter("reference:tuned", load_scenario(task))
+    robots = run_policy(entry.scenario, entry.policy, seed).metrics()
+    assert max(robot.position_rmse_mm for robot in robots) <= own_mm
+    assert max(robot.settled_formation_rmse_mm for robot in robots) <= formation_mm
 
 
 @pytest.mark.slow
