@@ -192,6 +192,7 @@ class Arrays(NamedTuple):
     references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
     # truth
     paths: np.ndarray  # (x y, slot, robot, lane): ring over one gap and the window behind it
+    longest: np.ndarray  # (robot, lane): longest way within a control step so far, mm
     # time and random numbers
     clock: np.ndarray  # (lane, 3) int64: substeps, control steps, episode
     seeds: np.ndarray  # (lane,) int64
@@ -339,6 +340,7 @@ def make_arrays(
         observers=zeros(3),
         references=np.zeros((len(Reference._fields), lookahead + 1, n, lanes)),
         paths=np.zeros((2, gap + window + 1, n, lanes)),
+        longest=np.zeros((n, lanes)),
         clock=np.zeros((lanes, 3), dtype=np.int64),
         seeds=np.zeros(lanes, dtype=np.int64),
         actions=np.zeros((lanes, n, ACTION_SIZE)),
