@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow test-learning check format speed constraints clean
+.PHONY: help run test test-slow test-learning check format speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -38,6 +38,10 @@ format: $(VENV)/.stamp-test ## Sort the imports and format the sources
 
 speed: $(VENV)/.stamp-test ## Measure the steps per second, beside a peer
 	$(BIN)/tlf speed
+
+speed-docs: $(VENV)/.stamp-test ## Measure them for docs/performance.md, and write its tables and figure
+	$(BIN)/tlf speed --out docs/performance.json >/dev/null
+	$(BIN)/python docs/figures/make_speed.py
 
 # torch is fixed by hand (make constraints TORCH=...), and everything else is resolved anew. What
 # torch requires on one kind of machine only is left out.

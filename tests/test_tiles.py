@@ -123,8 +123,8 @@ def test_lanes_give_the_same_bits_alone_and_together(overrides):
 def test_what_else_is_in_the_arrays_does_not_matter(lanes):
     few, many = step_all(*thrown_about(lanes)), step_all(*thrown_about(64))
     for name in ("motions", "contacts", "estimates", "traces", "sensors", "loop_states"):
-        got, wanted = getattr(few, name), getattr(many, name)[:, :, :lanes]
-        assert got.tobytes() == np.ascontiguousarray(wanted).tobytes()
+        got, wanted = (getattr(arrays, name)[:, :, :lanes] for arrays in (few, many))
+        assert got.tobytes() == wanted.tobytes()
 
 
 def test_rolling_and_sliding_robots_and_a_stuck_steering_occur():

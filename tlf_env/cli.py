@@ -239,14 +239,68 @@ def openloop(
 def speed(
     steps: Annotated[int, typer.Option(help="Environment steps per timing.")] = 1000,
     repeats: Annotated[int, typer.Option(help="Timings of each environment, taken in turn.")] = 7,
+    formations: Annotated[
+        str, typer.Option(help="Formations of the vector environment, parted by commas, or none.")
+    ] = "1,32,1024,8192",
+    threads: Annotated[str, typer.Option(help="Threads, parted by commas.")] = "1,2",
+    peers: Annotated[
+        bool, typer.Option(help="Measure mpe2 and VMAS too, where they are installed.")
+    ] = True,
+    parts: Annotated[bool, typer.Option(help="Tell where the time of a step goes.")] = True,
+    out: Annotated[Path | None, typer.Option(help="Write the JSON to this file too.")] = None,
 ) -> None:
-    """Environment steps per second as JSON, beside mpe2's simple_spread_v3 where it is installed."""
+    """Steps per second as JSON (a table on stderr), beside mpe2 and VMAS where they are installed."""
     from baselines.speed import measure
 
+    counts = [] if formations == "none" else whole_numbers("formations", formations)
     warn_of_compiling()
     with progress_bar("speed") as update:
-        result = measure(steps, repeats, progress=update)
-    typer.echo(json.dumps(result, indent=2))
+        result = measure(
+            steps,
+            repeats,
+            update,
+            formations=counts,
+            threads=whole_numbers("threads", threads),
+            peers=peers,
+            parts=parts,
+        )
+    text = json.dumps(result, indent=2)
+    if out is not None:
+        out.write_text(text + "\n", encoding="utf-8")
+    notes.print(speed_table(result))
+    typer.echo(text)
+
+
+def whole_numbers(name: str, text: str) -> list[int]:
+    """Whole numbers parted by commas.
+
+    Raises
+    ------
+    ValueError
+        naming the option, for anything else.
+    """
+    try:
+        return [int(part) for part in text.split(",")]
+    except ValueError:
+        raise ValueError(f"--{name} {text!r} must be whole numbers parted by commas") from None
+
+
+def speed_table(result: dict[str, Any]) -> Table:
+    """Agent steps per second of every environment that was measured."""
+    table = Table(box=SIMPLE_HEAD)
+    for name in ("environment", "robots", "formations", "threads", "agent steps/s", "to mpe2"):
+        table.add_column(name, justify="left" if name == "environment" else "right")
+    keys = ("env", "robots", "formations", "threads")
+    ratios = {
+        tuple(row[key] for key in keys): row["ratio"]
+        for row in result["ratios"]
+        if row["to"].startswith("mpe2")
+    }
+    for row in result["results"]:
+        place = tuple(row[key] for key in keys)
+        ratio = f"{ratios[place]:.1f} ×" if place in ratios else ""
+        table.add_row(*map(str, place), f"{row['agent_steps_per_s']:.0f}", ratio)
+    return table
 
 
 @app.command()

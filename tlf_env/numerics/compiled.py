@@ -76,14 +76,34 @@ def law(function: F) -> F:
 
     Division by zero gives infinity as in NumPy (no branch per division), and no fast-math: two
     drivers that inline the same law must agree to the last bit.
+
+    Laws and blocks do not count references to the arrays that they are handed: whoever calls holds
+    them, and a count is an atomic write that threads would wait for. So they make no arrays, only views.
     """
-    compiled: F = numba.njit(error_model="numpy", forceinline=True, nogil=True)(function)
+    compiled: F = numba.njit(error_model="numpy", forceinline=True, nogil=True, _nrt=False)(
+        function
+    )
     return compiled
 
 
 def block(function: F) -> F:
-    """Compile a larger law that is called rather than inlined, to keep compile times short."""
-    compiled: F = numba.njit(error_model="numpy", nogil=True)(function)
+    """Compile a larger law that is called rather than inlined, to keep compile times short.
+
+    A call copies the whole tuple of arrays, so that a block is best a loop over robots or lanes.
+    """
+    compiled: F = numba.njit(error_model="numpy", nogil=True, _nrt=False)(function)
+    return compiled
+
+
+def view(function: F) -> F:
+    """Compile a function that returns a view of an array, into its callers' own source."""
+    compiled: F = numba.njit(error_model="numpy", nogil=True, inline="always")(function)
+    return compiled
+
+
+def allocating(function: F) -> F:
+    """Compile a short function that makes an array and hands it to a block."""
+    compiled: F = numba.njit(error_model="numpy", forceinline=True, nogil=True)(function)
     return compiled
 
 

@@ -153,6 +153,8 @@ class Variants(NamedTuple):
 class Arrays(NamedTuple):
     """``(field, robot, lane)`` unless said; a lane is one formation.
 
+    Where lanes come last there may be a few more than formations, which nobody uses (:func:`padded`).
+
     Lanes may run different scenarios, their :class:`Variants`.
     """
 
@@ -192,6 +194,7 @@ class Arrays(NamedTuple):
     references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
     # truth
     paths: np.ndarray  # (x y, slot, robot, lane): ring over one gap and the window behind it
+    longest: np.ndarray  # (robot, lane): longest way within a control step so far, mm
     # time and random numbers
     clock: np.ndarray  # (lane, 3) int64: substeps, control steps, episode
     seeds: np.ndarray  # (lane,) int64
@@ -235,6 +238,8 @@ def _per_variant(rows: Sequence[tuple[float, ...]], robots: int) -> np.ndarray:
     return np.ascontiguousarray(np.repeat(np.array(rows).T[:, None, :], robots, axis=1))
 
 
+FEW_LANES = 64
+DOUBLES_PER_CACHE_LINE = 8
 NOWHERE = PatchRow(x=math.inf, y=0.0, radius=0.0, scale=1.0)
 
 
@@ -278,6 +283,17 @@ def make_variants(scenarios: Sequence[Scenario], mixture: Sequence[float] = ()) 
     )
 
 
+def padded(lanes: int) -> int:
+    """How many lanes a row has, so that rows of many lanes are an odd number of cache lines long.
+
+    A power of two would put one lane's numbers of all rows into the same few places of the cache.
+    """
+    if lanes < FEW_LANES:
+        return lanes
+    cache_lines = -(-lanes // DOUBLES_PER_CACHE_LINE)
+    return DOUBLES_PER_CACHE_LINE * (cache_lines | 1)
+
+
 def make_arrays(
     scenarios: Sequence[Scenario],
     table: np.ndarray,
@@ -299,9 +315,10 @@ def make_arrays(
     dead = max(round(longest(one, DEAD_TIME) / one.physics_period_s) for one in scenarios)
     late = max(math.ceil(longest(one, JITTER) / one.control_period_s) for one in scenarios)
     ring = gap + 1 + late
+    columns = padded(lanes)
 
     def zeros(fields: int) -> np.ndarray:
-        return np.zeros((fields, n, lanes))
+        return np.zeros((fields, n, columns))
 
     return Arrays(
         signals=np.array(
@@ -321,24 +338,25 @@ def make_arrays(
         motions=zeros(len(Motion._fields)),
         contacts=zeros(len(Contact._fields)),
         processes=zeros(len(CHANNELS)),
-        applied=_constant(tuple(channel.nominal for channel in CHANNELS), n, lanes),
-        imposed=np.full((len(CHANNELS), n, lanes), np.nan),
-        torques=np.zeros((2, dead + 1, n, lanes)),
+        applied=_constant(tuple(channel.nominal for channel in CHANNELS), n, columns),
+        imposed=np.full((len(CHANNELS), n, columns), np.nan),
+        torques=np.zeros((2, dead + 1, n, columns)),
         loop_states=zeros(len(WheelLoopState._fields)),
         sensors=zeros(len(Sensors._fields)),
         estimates=zeros(len(Estimate._fields)),
         slip_estimates=zeros(len(SlipEstimate._fields)),
         traces=zeros(len(Trace._fields)),
-        kinds=np.full((n, lanes), ACTION_KINDS[scenario.action], dtype=np.int64),
+        kinds=np.full((n, columns), ACTION_KINDS[scenario.action], dtype=np.int64),
         wanted=zeros(2),
         wanted_before=zeros(2),
         commands=zeros(2),
-        samples=np.zeros((scenario.substeps, len(Sample._fields), n, lanes)),
-        dropped=np.zeros((ring, n, lanes), dtype=np.bool_),
-        messages=np.zeros((len(Message._fields), ring, n, lanes)),
+        samples=np.zeros((scenario.substeps, len(Sample._fields), n, columns)),
+        dropped=np.zeros((ring, n, columns), dtype=np.bool_),
+        messages=np.zeros((len(Message._fields), ring, n, columns)),
         observers=zeros(3),
-        references=np.zeros((len(Reference._fields), lookahead + 1, n, lanes)),
-        paths=np.zeros((2, gap + window + 1, n, lanes)),
+        references=np.zeros((len(Reference._fields), lookahead + 1, n, columns)),
+        paths=np.zeros((2, gap + window + 1, n, columns)),
+        longest=np.zeros((n, columns)),
         clock=np.zeros((lanes, 3), dtype=np.int64),
         seeds=np.zeros(lanes, dtype=np.int64),
         actions=np.zeros((lanes, n, ACTION_SIZE)),

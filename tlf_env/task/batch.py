@@ -22,7 +22,7 @@ from tlf_env.task.starting import STARTED
 Source = str | Path | Mapping[str, Any] | Scenario
 
 MAY_DIFFER = ("name", "robots", "robot", "wheel_loop", "ekf", "ekf_slip", "disturbance")
-LANES_PER_BLOCK = 64  # what a thread takes at a time
+LANES_PER_BLOCK = 128  # what a thread takes at a time
 
 
 class BatchPlant:
@@ -241,7 +241,7 @@ class BatchPlant:
     @property
     def applied(self) -> np.ndarray:
         """The channels' last values, (formations, robots, channel), channels as in ``PATHS``."""
-        return self.arrays.applied.transpose(2, 1, 0)
+        return self.arrays.applied[:, :, : self.formations].transpose(2, 1, 0)
 
     @property
     def step_counts(self) -> np.ndarray:

@@ -46,7 +46,7 @@ from tlf_env.task.outlines import mark_touched, room_to_move
 from tlf_env.task.radio import broadcast, delayed_message, next_reference
 from tlf_env.task.settings import Settings
 from tlf_env.task.starting import STARTED, fill, start_lane
-from tlf_env.task.substeps import delays, evaluate
+from tlf_env.task.substeps import delays, evaluate, refresh
 from tlf_env.task.tiles import advance
 
 DONE, MUST_COLLIDE, MUST_SUBSTEP = -1, -2, -3
@@ -84,7 +84,7 @@ def first_bad_action(a: Arrays, first: int, last: int) -> int:
     return DONE
 
 
-@block
+@law
 def take_actions(a: Arrays, lane: int, s: Settings) -> None:
     """Clip the actions of a lane and turn them into commands; clears the traces."""
     for r in range(a.actions.shape[1]):
@@ -102,14 +102,22 @@ def take_actions(a: Arrays, lane: int, s: Settings) -> None:
         a.wanted[0, r, lane], a.wanted[1, r, lane] = command(a, lane, r, s)
         a.commands[0, r, lane] = a.wanted[0, r, lane]
         a.commands[1, r, lane] = a.wanted[1, r, lane]
-        evaluate(a, lane, r, SUBSTEP_CHANNELS, STEP_CHANNELS, a.clock[lane, 0], s)
+        tick = a.clock[lane, 0]
+        refresh(a, lane, r, SUBSTEP_CHANNELS, STEP_CHANNELS, tick, s.substeps, s)
         if s.adversary and not s.changing:
-            evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, a.clock[lane, 0], s)
+            evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, tick, s)
         a.lost_now[lane, r] = a.touched_now[lane, r] = False
     fill(a.traces, lane, 0.0)
 
 
 @block
+def take_all_actions(a: Arrays, first: int, last: int, s: Settings) -> None:
+    """:func:`take_actions` of the lanes from ``first`` to before ``last``."""
+    for lane in range(first, last):
+        take_actions(a, lane, s)
+
+
+@law
 def transmit_lane(a: Arrays, lane: int, s: Settings) -> None:
     """Count the control step; everybody broadcasts."""
     step = a.clock[lane, 1] + 1
@@ -119,7 +127,7 @@ def transmit_lane(a: Arrays, lane: int, s: Settings) -> None:
         record_truth(a, lane, r, step)
 
 
-@block
+@law
 def look_lane(a: Arrays, lane: int, s: Settings) -> None:
     """Errors, rewards and observations of a lane as it stands."""
     robots = a.motions.shape[1]
@@ -130,18 +138,28 @@ def look_lane(a: Arrays, lane: int, s: Settings) -> None:
         if a.sensor_observations.shape[2] > 0:
             observe_sensors(a, lane, r, step, s)
     if s.cooperative:
-        mean = a.rewards[lane].mean()
-        a.rewards[lane, :] = mean
+        total = 0.0
+        for r in range(robots):
+            total += a.rewards[lane, r]
+        for r in range(robots):
+            a.rewards[lane, r] = total / robots
     end_lane(a, lane, s)
 
 
 @block
-def conclude_lane(a: Arrays, lane: int, s: Settings) -> None:
-    """After the substeps of a control step: radio, observers, errors, rewards and observations."""
-    transmit_lane(a, lane, s)
-    for r in range(a.motions.shape[1]):
-        next_reference(a, lane, r, a.clock[lane, 1] + s.lookahead, s)
-    look_lane(a, lane, s)
+def transmit_all(a: Arrays, first: int, last: int, s: Settings) -> None:
+    """:func:`transmit_lane` of the lanes from ``first`` to before ``last``, and their next references."""
+    for lane in range(first, last):
+        transmit_lane(a, lane, s)
+        for r in range(a.motions.shape[1]):
+            next_reference(a, lane, r, a.clock[lane, 1] + s.lookahead, s)
+
+
+@block
+def look_all(a: Arrays, first: int, last: int, s: Settings) -> None:
+    """:func:`look_lane` of the lanes from ``first`` to before ``last``."""
+    for lane in range(first, last):
+        look_lane(a, lane, s)
 
 
 @driver
@@ -177,7 +195,7 @@ def look(a: Arrays, mask: np.ndarray, at_start: bool, s: Settings) -> None:
     """:func:`look_lane` of the lanes of the mask; who starts lost is lost in the first step."""
     for lane in range(mask.shape[0]):
         if mask[lane]:
-            look_lane(a, lane, s)
+            look_all(a, lane, lane + 1, s)
             if at_start:
                 for r in range(a.ends.shape[1]):
                     a.lost[lane, r] = a.lost_now[lane, r] = False
@@ -198,9 +216,13 @@ def refer(a: Arrays, lane: int, first: int, last: int, s: Settings) -> None:
 
 
 @block
-def are_near(a: Arrays, lane: int, s: Settings) -> bool:
-    """Whether outlines could meet within the control step; without torques only its end counts."""
-    return not s.kinematic and not room_to_move(a, lane, s.period)
+def find_near(a: Arrays, first: int, last: int, near: np.ndarray, s: Settings) -> None:
+    """Mark the lanes from ``first`` on whose outlines could meet within the control step.
+
+    Without torques only its end counts.
+    """
+    for lane in range(first, last):
+        near[lane - first] = not s.kinematic and not room_to_move(a, lane, s.period)
 
 
 @driver
@@ -237,18 +259,18 @@ def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
         return bad
     apart_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
     close_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
+    near = np.empty(LANES_AT_ONCE, dtype=np.bool_)
     for begin in range(first, last, LANES_AT_ONCE):
         end = min(begin + LANES_AT_ONCE, last)
-        for lane in range(begin, end):
-            take_actions(a, lane, s)
+        take_all_actions(a, begin, end, s)
+        find_near(a, begin, end, near, s)
         apart = close = 0
         for lane in range(begin, end):
-            near = are_near(a, lane, s)
-            if near and s.collides:
+            if near[lane - begin] and s.collides:
                 return MUST_COLLIDE
             if s.has_parts:
                 return MUST_SUBSTEP
-            if near:
+            if near[lane - begin]:
                 close_lanes[close], close = lane, close + 1
             else:
                 apart_lanes[apart], apart = lane, apart + 1
@@ -262,6 +284,6 @@ def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
         for k in range(s.substeps if close > 0 else 0):
             advance(a, lanes, k, k + 1, True, True, s)
             mark_all_touched(a, lanes)
-        for lane in range(begin, end):
-            conclude_lane(a, lane, s)
+        transmit_all(a, begin, end, s)
+        look_all(a, begin, end, s)
     return DONE

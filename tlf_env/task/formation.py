@@ -196,11 +196,12 @@ def refusal(a: Arrays, of: Variants, result: int, r: int, lane: int = 0) -> str:
 
 def state_rows(a: Arrays) -> np.ndarray:
     """True state, (lane, robot, :class:`State`), in physical units."""
-    m = Motion(*a.motions)
-    d = a.bodies[BODY_D]
+    lanes = a.clock.shape[0]
+    m = Motion(*a.motions[:, :, :lanes])
+    d = a.bodies[BODY_D, :, :lanes]
     sin, cos = np.sin(m.theta), np.cos(m.theta)
     slots = (a.clock[:, 1] % a.references.shape[1])[None, None, :]
-    x, y = np.take_along_axis(a.references[:2], slots[None], axis=1)[:, 0]
+    x, y = np.take_along_axis(a.references[:2, :, :, :lanes], slots[None], axis=1)[:, 0]
     rows = [
         m.x - d * sin,
         m.y + d * cos,

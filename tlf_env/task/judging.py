@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from tlf_env.numerics.angles import wrap
-from tlf_env.numerics.compiled import block, law
+from tlf_env.numerics.compiled import law
 from tlf_env.onboard.estimator import odometry, read_estimate
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.tracking import body_errors
@@ -34,7 +34,7 @@ CLIPPED = Info._fields.index("clipped")
 BODY_D = Body._fields.index("d")
 
 
-@block
+@law
 def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     """Write the ``tracking`` observation of one robot."""
     robots = a.motions.shape[1]
@@ -86,7 +86,7 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
             a.observations[lane, r, j] = scaled(preview[i], a.scales[j])
 
 
-@block
+@law
 def observe_sensors(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     """Write the ``sensor`` observation of one robot."""
     out = a.sensor_observations[lane, r]
@@ -131,15 +131,21 @@ def wanted_of_formation(a: Arrays, lane: int, r: int, step: int, gap: int) -> tu
     return a.table[k, 0], a.table[k, 1]
 
 
-@block
+@law
 def record_truth(a: Arrays, lane: int, r: int, step: int) -> None:
     """Put the true place of robot ``r`` into the ring of paths."""
     slot = step % a.paths.shape[1]
     x, y = axle_midpoint(read_motion(a.motions, r, lane), a.bodies[BODY_D, r, lane])
     a.paths[0, slot, r, lane], a.paths[1, slot, r, lane] = x, y
+    if step == 0:
+        a.longest[r, lane] = 0.0
+    else:
+        before = (step - 1) % a.paths.shape[1]
+        way = distance(x, y, a.paths[0, before, r, lane], a.paths[1, before, r, lane])
+        a.longest[r, lane] = max(a.longest[r, lane], way)
 
 
-@block
+@law
 def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     """Write the true errors, the reward terms and whether one robot is lost."""
     motion = read_motion(a.motions, r, lane)
@@ -152,7 +158,7 @@ def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     late = 0.0
     if r > 0:
         path = a.paths[:, :, r - 1, lane]
-        late = time_gap_error(x, y, path, step, s.gap, s.window, s.period)
+        late = time_gap_error(x, y, path, step, s.gap, s.window, s.period, a.longest[r - 1, lane])
     to_Nmm = 1.0 / (s.substeps * MILLINEWTON_PER_NEWTON)
     info = Info(
         error,
@@ -194,7 +200,7 @@ def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     a.rewards[lane, r] = total
 
 
-@block
+@law
 def end_lane(a: Arrays, lane: int, s: Settings) -> None:
     """Whether and why the episode ended in this step: for the whole formation at once.
 

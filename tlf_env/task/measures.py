@@ -9,6 +9,7 @@ import numpy as np
 from tlf_env.numerics.compiled import law
 
 TIME_GAP_WINDOW_S = 2.0
+ROUNDING_MM = 1e-6  # more than distances of this size can be wrong by
 
 
 @law
@@ -39,26 +40,42 @@ def time_gap_error(
     gap_steps: int,
     window_steps: int,
     period_s: float,
+    longest: float,
 ) -> float:
     """How much later than one gap ago the predecessor passed where the follower is now, s.
 
     ``path[axis, slot]`` is a ring of the predecessor's true positions, one per control step; the
     nearest point of it within ±``window_steps`` of one gap ago is taken. Positive: the follower is
-    late. 0 while the predecessor has no past of one gap.
+    late. 0 while the predecessor has no past of one gap. ``longest`` bounds the way between two
+    neighbours in the ring, mm: what is too far away to be nearest is passed over.
     """
     if step < gap_steps:
         return 0.0
     slots = path.shape[1]
     first = max(step - gap_steps - window_steps, 0)
     last = min(step - gap_steps + window_steps, step)
+    if first >= last:
+        return 0.0
+    a = max(min(step - gap_steps, last - 1), first) % slots
+    b = a + 1 if a + 1 < slots else 0
+    _, squared = nearest_on_segment(x, y, path[0, a], path[1, a], path[0, b], path[1, b])
+    within = math.sqrt(squared) + ROUNDING_MM  # where the nearest point lies
     best, best_step = math.inf, 0.0
-    a = first % slots
-    for k in range(first, last):
-        b = a + 1 if a + 1 < slots else 0
-        fraction, squared = nearest_on_segment(x, y, path[0, a], path[1, a], path[0, b], path[1, b])
-        if squared < best:
-            best, best_step = squared, k + fraction
-        a = b
+    k, a = first, first % slots
+    while k < last:
+        spare = distance(x, y, path[0, a], path[1, a]) - within
+        if spare > longest:  # the next segments all lie farther away
+            passed = int(min(spare / longest, 1.0 * (last - k))) if longest > 0.0 else last - k
+            k, a = k + passed, (a + passed) % slots
+        else:
+            b = a + 1 if a + 1 < slots else 0
+            fraction, squared = nearest_on_segment(
+                x, y, path[0, a], path[1, a], path[0, b], path[1, b]
+            )
+            if squared < best:
+                best, best_step = squared, k + fraction
+                within = min(within, math.sqrt(squared) + ROUNDING_MM)
+            k, a = k + 1, b
     if math.isinf(best):
         return 0.0
     return (step - best_step - gap_steps) * period_s

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import math
 
-from tlf_env.numerics.compiled import block, law
+from tlf_env.numerics.compiled import law
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import read_motion
 from tlf_env.task.arrays import Arrays
-from tlf_env.task.measures import distance
+from tlf_env.task.measures import ROUNDING_MM, distance
 
 # Outlines that could come closer than this within a control step are stepped through the space.
 CLOSE_MARGIN_MM = 10.0
@@ -26,17 +26,29 @@ def outline_centre(a: Arrays, lane: int, r: int) -> tuple[float, float]:
     return motion.x - ahead * math.sin(motion.theta), motion.y + ahead * math.cos(motion.theta)
 
 
-@block
+@law
+def surely_apart(a: Arrays, lane: int, i: int, j: int, room: float) -> bool:
+    """Whether two outlines' centres are farther apart than ``room`` mm wherever the robots head."""
+    between = distance(
+        a.motions[0, i, lane], a.motions[1, i, lane], a.motions[0, j, lane], a.motions[1, j, lane]
+    )
+    ahead = abs(a.bodies[BODY_AHEAD, i, lane]) + abs(a.bodies[BODY_AHEAD, j, lane])
+    return between > room + ahead + ROUNDING_MM
+
+
+@law
 def room_to_move(a: Arrays, lane: int, duration: float) -> bool:
     """Whether no two outlines (circles) can meet, or nearly so, during ``duration`` s."""
     robots = a.motions.shape[1]
     for i in range(robots):
-        x_i, y_i = outline_centre(a, lane, i)
         speed_i = outline_speed(a, lane, i)
         for j in range(i):
-            x_j, y_j = outline_centre(a, lane, j)
             room = a.bodies[BODY_OUTLINE, i, lane] + a.bodies[BODY_OUTLINE, j, lane]
             closing = speed_i + outline_speed(a, lane, j) + 2.0 * FASTEST_CHANGE_MM_S2 * duration
+            if surely_apart(a, lane, i, j, room + CLOSE_MARGIN_MM + closing * duration):
+                continue
+            x_i, y_i = outline_centre(a, lane, i)
+            x_j, y_j = outline_centre(a, lane, j)
             if distance(x_i, y_i, x_j, y_j) - room <= CLOSE_MARGIN_MM + closing * duration:
                 return False
     return True
@@ -57,15 +69,17 @@ def touch(a: Arrays, lane: int, r: int) -> None:
         a.touched[lane, r] = a.touched_now[lane, r] = True
 
 
-@block
+@law
 def mark_touched(a: Arrays, lane: int) -> None:
     """Set ``touched`` for robots whose outlines meet."""
     robots = a.motions.shape[1]
     for i in range(robots):
-        x_i, y_i = outline_centre(a, lane, i)
         for j in range(i):
-            x_j, y_j = outline_centre(a, lane, j)
             room = a.bodies[BODY_OUTLINE, i, lane] + a.bodies[BODY_OUTLINE, j, lane]
+            if surely_apart(a, lane, i, j, room):
+                continue
+            x_i, y_i = outline_centre(a, lane, i)
+            x_j, y_j = outline_centre(a, lane, j)
             if distance(x_i, y_i, x_j, y_j) <= room:
                 touch(a, lane, i)
                 touch(a, lane, j)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 
-from tlf_env.numerics.compiled import block, law, slot_reader, slot_writer
+from tlf_env.numerics.compiled import law, slot_reader, slot_writer
 from tlf_env.numerics.philox import unit, words
 from tlf_env.onboard.observer import (
     Message,
@@ -27,7 +27,7 @@ read_message = slot_reader(Message)
 write_message = slot_writer(Message)
 
 
-@block
+@law
 def broadcast(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     """Put robot ``r``'s estimated pose and twist (odometry and estimated slip) on the air.
 
@@ -76,7 +76,7 @@ def delayed_message(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Mes
     return message
 
 
-@block
+@law
 def next_reference(a: Arrays, lane: int, r: int, m: int, s: Settings) -> None:
     """Put the reference of control step ``m`` into the ring and move the follower's observer on."""
     slot = m % a.references.shape[1]

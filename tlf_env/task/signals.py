@@ -204,6 +204,15 @@ Signal = Annotated[
 
 
 @law
+def is_due(kind: float, every: float, tick: int, ticks: int) -> bool:
+    """Whether a signal may have another value than it had ``ticks`` before."""
+    if kind != UNIFORM and kind != GAUSSIAN:
+        return kind != CONSTANT
+    between = int(every)
+    return between > 0 and tick // between != (tick - ticks) // between
+
+
+@law
 def signal_value(
     row: SignalRow,
     tick: int,

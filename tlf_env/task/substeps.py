@@ -41,7 +41,7 @@ from tlf_env.task.channels import (
 )
 from tlf_env.task.disturbance import Effects
 from tlf_env.task.settings import EKF, EKF_SLIP, TRUTH, Settings
-from tlf_env.task.signals import SignalRow, signal_value
+from tlf_env.task.signals import SignalRow, is_due, signal_value
 
 EXTERNAL_TORQUE = 4  # stands for the kind of a robot whose wheel loop is an object outside
 NOMINALS = np.array([channel.nominal for channel in CHANNELS])
@@ -248,6 +248,20 @@ def delays(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
     """Dead time of the torques, and for how long the last action still holds, in ticks."""
     dead = round(a.applied[DEAD_TIME, r, lane] / dt)
     return dead, round(a.applied[COMPUTING_DELAY, r, lane] / dt)
+
+
+@law
+def refresh(
+    a: Arrays, lane: int, r: int, first: int, last: int, tick: int, ticks: int, s: Settings
+) -> bool:
+    """Evaluate those channels that may have changed since ``ticks`` ago; whether there were any."""
+    found = False
+    for c in range(first, last):
+        row = a.signals[a.variants[lane], c]
+        if s.adversary or is_due(row[0], row[4], tick, ticks):
+            evaluate(a, lane, r, c, c + 1, tick, s)
+            found = True
+    return found
 
 
 @block

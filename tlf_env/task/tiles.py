@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from tlf_env.numerics.compiled import block, law, row_reader, row_writer
+from tlf_env.numerics.compiled import allocating, block, law, row_reader, row_writer, view
 from tlf_env.onboard.estimator import Ekf, Estimate
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
 from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState
@@ -40,8 +40,8 @@ from tlf_env.task.substeps import (
     asked_torques,
     delays,
     disturbed_encoders,
-    evaluate,
     floor_under,
+    refresh,
     sense_robot,
     trace_drive,
     undisturbed,
@@ -130,19 +130,19 @@ ENCODER_STD = EFFECTS + Effects._fields.index("encoder_std")
 QUANTUM = EFFECTS + Effects._fields.index("quantum")
 
 
-@law
+@view
 def whole(tile: np.ndarray) -> np.ndarray:
     """The tile as whole numbers, for the rows that hold such."""
     return tile.view(np.int64)
 
 
-@law
+@view
 def columns_of(tile: np.ndarray) -> np.ndarray:
     """The row of columns; unsigned, so that no index can count from an array's end."""
     return tile.view(np.uint64)[COLUMN]
 
 
-@law
+@view
 def flat(array: np.ndarray) -> np.ndarray:
     """An array (field, robot, lane) as (field, column)."""
     return array.reshape((array.shape[0], array.shape[1] * array.shape[2]))
@@ -198,10 +198,12 @@ def assign(
 def change_effects(a: Arrays, tile: np.ndarray, count: int, s: Settings) -> None:
     """Evaluate the channels that may change in every substep."""
     lanes = a.motions.shape[2]
+    changed = False
     for i in range(count):
         draw, column = draw_of(whole(tile), i), whole(tile)[COLUMN, i]
-        evaluate(a, column % lanes, draw.robot, 0, SUBSTEP_CHANNELS, draw.tick, s)
-    load(tile, EFFECTS, flat(a.applied[:SUBSTEP_CHANNELS]), columns_of(tile))
+        changed |= refresh(a, column % lanes, draw.robot, 0, SUBSTEP_CHANNELS, draw.tick, 1, s)
+    if changed:
+        load(tile, EFFECTS, flat(a.applied[:SUBSTEP_CHANNELS]), columns_of(tile))
 
 
 @block
@@ -235,10 +237,12 @@ def delay_torques(torques: np.ndarray, tile: np.ndarray, count: int) -> None:
 
 
 @block
-def meet_patches(patches: np.ndarray, variants: np.ndarray, tile: np.ndarray, count: int) -> None:
+def meet_patches(
+    patches: np.ndarray, variants: np.ndarray, lanes: int, tile: np.ndarray, count: int
+) -> None:
     """Scale the friction of the tyres that stand on a patch."""
     for i in range(count):
-        drive, lane = drive_of(tile, i), whole(tile)[COLUMN, i] % variants.shape[0]
+        drive, lane = drive_of(tile, i), whole(tile)[COLUMN, i] % lanes
         on_l, on_r, on_c = wheel_factors(
             patches[variants[lane]], body_of(tile, i), motion_of(tile, i)
         )
@@ -382,16 +386,30 @@ def sense_tile(tile: np.ndarray, estimator: int, dt: float) -> None:
         set_sample(tile, i, sample)
 
 
-@block
+@allocating
 def advance(
     a: Arrays, lanes: np.ndarray, begin: int, end: int, actuates: bool, senses: bool, s: Settings
+) -> None:
+    """:func:`advance_in` a tile of its own."""
+    advance_in(np.empty((ROWS, WIDTH)), a, lanes, begin, end, actuates, senses, s)
+
+
+@block
+def advance_in(
+    tile: np.ndarray,
+    a: Arrays,
+    lanes: np.ndarray,
+    begin: int,
+    end: int,
+    actuates: bool,
+    senses: bool,
+    s: Settings,
 ) -> None:
     """Run the substeps ``begin`` to before ``end`` of a control step of some lanes, without contact.
 
     Without ``senses`` each stops after the plant's new velocities and poses, and without ``actuates`` it
     begins there.
     """
-    # Every use of an array through the tuple counts its references; here that is done once.
     bodies, loops, ekfs = flat(a.bodies), flat(a.wheel_loops), flat(a.ekfs)
     applied = flat(a.applied[:SUBSTEP_CHANNELS])
     motions, contacts, traces = flat(a.motions), flat(a.contacts), flat(a.traces)
@@ -399,7 +417,6 @@ def advance(
     slip_ekfs, slips = flat(a.slip_ekfs), flat(a.slip_estimates)
     samples = a.samples.reshape((*a.samples.shape[:2], a.motions.shape[1] * a.motions.shape[2]))
     torques, patches, variants = a.torques, a.patches, a.variants
-    tile = np.empty((ROWS, WIDTH))
     columns = columns_of(tile)
     items = lanes.shape[0] * a.motions.shape[1]
     for item in range(0, items, WIDTH):
@@ -428,7 +445,7 @@ def advance(
                     if torques.shape[1] > 1:
                         delay_torques(torques, tile, count)
                     if patches.shape[1] > 0:
-                        meet_patches(patches, variants, tile, count)
+                        meet_patches(patches, variants, a.motions.shape[2], tile, count)
                     move(tile, count, s.dt)
             if senses:
                 sense_tile(tile, s.estimator, s.dt)
