@@ -292,6 +292,7 @@ def measure(
         raise ValueError(f"steps {steps} and repeats {repeats} must be at least 1")
     if any(number < 1 for number in (*formations, *threads)):
         raise ValueError(f"formations {formations} and threads {threads} must be at least 1")
+    load = round(os.getloadavg()[0], 1) if hasattr(os, "getloadavg") else None
     courses: list[Course] = []
     for robots in ROBOTS:
         courses.append(formation_course(robots, steps))
@@ -318,6 +319,7 @@ def measure(
             "processor": processor_name(),
             "cores": os.cpu_count(),
             "system": platform.platform(terse=True),
+            "load_average": load,
         },
         "versions": versions()
         | {name: version(name) for name in ("mpe2", "vmas", "torch") if peers and find_spec(name)},

@@ -68,7 +68,8 @@ def machine(result: dict[str, Any]) -> str:
     about, found = result["machine"], result["versions"]
     versions = ", ".join(f"{name} {value}" for name, value in found.items())
     return (
-        f"{about['processor']}, {about['cores']} cores, {about['system']}; {versions}. "
+        f"{about['processor']}, {about['cores']} cores, {about['system']}, load average "
+        f"{about.get('load_average', 'unknown')} at the start; {versions}. "
         f"Medians of {result['repeats']} timings, smallest and largest in brackets."
     )
 
@@ -127,11 +128,11 @@ def memory(result: dict[str, Any]) -> str:
 def written(text: str, result: dict[str, Any]) -> str:
     """A page with everything between its markers made anew."""
     for make in (machine, speeds, parts, scaling, memory):
-        mark = f"<!-- {make.__name__} -->\n"
+        mark = f"<!-- {make.__name__} -->"
         if text.count(mark) != 1:
             raise ValueError(f"performance.md must have one line {mark!r}")
         before, after = text.split(mark)
-        text = before + mark + make(result) + after[after.index("\n<!-- end -->") :]
+        text = before + mark + "\n" + make(result) + after[after.index("\n<!-- end -->") :]
     return text
 
 
@@ -184,7 +185,7 @@ def speed(result: dict[str, Any]) -> Figure:
     axes.set_xscale("log")
     axes.set_yscale("log")
     counts = sorted({row["formations"] for row in result["results"]})
-    axes.set_xticks(counts, [number(count) for count in counts])
+    axes.set_xticks(counts, [f"{count:,}".replace(",", " ") for count in counts])
     axes.minorticks_off()
     axes.grid(which="major", color="0.9", lw=0.6)
     axes.set_xlabel("formations side by side")
