@@ -179,7 +179,7 @@ def test_limits_hold_on_every_command_of_an_episode(disturbance):
         slip = a.slip_estimates[:2, :, 0].copy()
         a.actions[0] = policy.predict(a.observations[0])[0]
         formation.step()
-        twist = np.array(odometry(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h))
+        twist = np.array(odometry.py_func(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h))
         step, lateral = np.abs(twist - last), np.abs(np.prod(twist + slip, axis=0))
         assert (step[0] <= ALL.step_1 + 1e-3).all()
         assert (lateral <= ALL.lateral + 0.05).all()
@@ -218,7 +218,7 @@ def test_a_residual_stays_within_the_limits_of_its_base():
     for _ in range(scenario.horizon_steps):
         a.actions[0] = rng.uniform(-1, 1, a.actions[0].shape)
         formation.step()
-        u_1, u_2 = odometry(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h)
+        u_1, u_2 = odometry.py_func(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h)
         assert (np.abs(u_1 - last) <= ALL.step_1 + 1e-3).all()
         assert (np.abs(u_1 * u_2) <= ALL.lateral + 0.05).all()
         last = u_1
