@@ -106,7 +106,9 @@ class Moments:
     """Some formations under the reference at several moments of a lap, and all their actions."""
 
     def __init__(self, robots: int, kept: int = STEPS_KEPT) -> None:
-        plant = BatchPlant("infinity", SEEDS, robots=robots, end_on=(), residual_base=GAINS)
+        plant = BatchPlant(
+            "infinity", SEEDS, robots=robots, end_on=(), residual_base=GAINS, estimator="ekf-slip"
+        )
         plant.reset(seed=0)
         plant.arrays.kinds[:] = REFERENCE
         idle = np.zeros(plant.arrays.actions.shape)
@@ -168,6 +170,7 @@ class VectorRun:
             robots=moments.robots,
             end_on=(),
             residual_base=GAINS,
+            estimator="ekf-slip",
             threads=max(THREADS),
         )
         self.env.reset(seed=0)
