@@ -46,7 +46,8 @@ MPE2, VMAS, ALONE, VECTOR = (
 
 # Formations of a batch start the timing where some others stand in the middle of their episodes.
 SEEDS = 32
-GAINS = "tuned"  # of the reference that drives them: none of them gets lost
+# The reference that drives them, on the estimate that it is tuned for: none of them gets lost.
+DRIVEN: dict[str, Any] = {"residual_base": "tuned", "estimator": "ekf-slip"}
 BEGUN_STEPS = 1000  # all robots are on their way
 MOMENTS = 16
 STEPS_BETWEEN_MOMENTS = 100
@@ -106,9 +107,7 @@ class Moments:
     """Some formations under the reference at several moments of a lap, and all their actions."""
 
     def __init__(self, robots: int, kept: int = STEPS_KEPT) -> None:
-        plant = BatchPlant(
-            "infinity", SEEDS, robots=robots, end_on=(), residual_base=GAINS, estimator="ekf-slip"
-        )
+        plant = BatchPlant("infinity", SEEDS, robots=robots, end_on=(), **DRIVEN)
         plant.reset(seed=0)
         plant.arrays.kinds[:] = REFERENCE
         idle = np.zeros(plant.arrays.actions.shape)
@@ -169,9 +168,8 @@ class VectorRun:
             formations,
             robots=moments.robots,
             end_on=(),
-            residual_base=GAINS,
-            estimator="ekf-slip",
             threads=max(THREADS),
+            **DRIVEN,
         )
         self.env.reset(seed=0)
         self._next = moments.kept

@@ -66,7 +66,7 @@ def moments():
 
 def test_formations_are_put_where_the_recorded_ones_stood(moments):
     count = len(moments.lanes)
-    plant = BatchPlant("infinity", 3 * count, robots=3, end_on=(), residual_base=speed.GAINS)
+    plant = BatchPlant("infinity", 3 * count, robots=3, end_on=(), **speed.DRIVEN)
     plant.reset(seed=0)
     moments.spread(plant)
     assert plant.step_counts.tolist() == np.repeat([1000, 1100, 1200], count).tolist()
@@ -75,10 +75,7 @@ def test_formations_are_put_where_the_recorded_ones_stood(moments):
 
 
 def test_recorded_actions_go_on_where_the_reference_went(moments):
-    runs = [
-        BatchPlant("infinity", 100, robots=3, end_on=(), residual_base=speed.GAINS)
-        for _ in range(2)
-    ]
+    runs = [BatchPlant("infinity", 100, robots=3, end_on=(), **speed.DRIVEN) for _ in range(2)]
     for plant in runs:
         plant.reset(seed=0)
         moments.spread(plant)

@@ -8,7 +8,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-import tlf_env  # noqa: F401
+import tlf_env  # noqa: F401  registers the environments
 
 SHORT = {"horizon_s": 5.0, "time_gap_s": 1.0, "preview_s": (0.5,), "plant": "batch"}
 ROUGH = {**SHORT, "disturbance": "combined-hard", "lost_beyond_mm": 150.0}
