@@ -84,6 +84,7 @@ class Card(Frozen):
     preview_s: tuple[NonNegative, ...]  # () for sensor, which has none
     control_period_s: Positive
     residual_base: Word | None = None  # gains that a residual is added to
+    residual_fade_mm: NonNegative = 0.0  # estimated error at which the residual counts half
     estimator: Word | None = None  # None: whatever the scenario has
 
     network: Network
@@ -152,6 +153,7 @@ def interface(scenario: Scenario) -> dict[str, Any]:
         "control_period_s": scenario.control_period_s,
         "action": scenario.action,
         "residual_base": scenario.residual_base if scenario.action == "residual" else None,
+        "residual_fade_mm": scenario.residual_fade_mm if scenario.action == "residual" else 0.0,
         "estimator": scenario.estimator,
         "observation": scenario.observation,
         "preview_s": scenario.preview_s if tracking else (),

@@ -101,6 +101,8 @@ class LearnedPolicy:
         card = self.card
         asked: dict[str, Any] = {"action": card.action, "observation": card.observation}
         asked |= {"residual_base": card.residual_base, "estimator": card.estimator}
+        if card.residual_fade_mm:
+            asked["residual_fade_mm"] = card.residual_fade_mm
         if card.observation == "tracking":
             asked["preview_s"] = card.preview_s
         self.scenario_overrides = {

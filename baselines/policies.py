@@ -21,7 +21,14 @@ CLASSICAL = {"pure_pursuit": PurePursuit, "feedback_linearisation": FeedbackLine
 
 # What a policy may ask of a scenario: what it sees, what it acts on, and what runs on board. Nothing
 # that changes the task or the disturbance, which are the same for everybody.
-OVERRIDABLE = ("action", "observation", "residual_base", "estimator", "preview_s")
+OVERRIDABLE = (
+    "action",
+    "observation",
+    "residual_base",
+    "residual_fade_mm",
+    "estimator",
+    "preview_s",
+)
 
 
 class Entry(NamedTuple):

@@ -127,7 +127,7 @@ class FormationVecEnv(VecEnv):
         self._seed = None
         self._reset_seeds()
         self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
-        return self._observations()
+        return self.observations()
 
     def step_async(self, actions: np.ndarray) -> None:
         """Take the actions, ``(num_envs, 2)``."""
@@ -156,7 +156,7 @@ class FormationVecEnv(VecEnv):
         infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
         dones = np.concatenate([(plant.ends != 0).ravel() for plant in self.plants])
         if dones.any():
-            last = self._observations()
+            last = self.observations()
             reasons = np.concatenate([plant.ends.ravel() for plant in self.plants])
             truncated = np.concatenate([plant.truncated.ravel() for plant in self.plants])
             for i in np.flatnonzero(dones):
@@ -167,15 +167,15 @@ class FormationVecEnv(VecEnv):
                 }
             for plant in self.plants:
                 plant.reset_finished()
-        return self._observations(), rewards.astype(np.float32), dones, infos
+        return self.observations(), rewards.astype(np.float32), dones, infos
 
     def _parts(self, rows: np.ndarray) -> Iterable[tuple[BatchPlant, np.ndarray]]:
         """Each plant with its sub-environments' rows."""
         for plant, first, end in zip(self.plants, self._ends, self._ends[1:], strict=False):
             yield plant, rows[first:end]
 
-    def _observations(self) -> np.ndarray:
-        """A copy: SB3 keeps the last observations while the next ones are made."""
+    def observations(self) -> np.ndarray:
+        """The present ones, ``(num_envs, entries)``; a copy: SB3 keeps them while it makes the next."""
         width = self.plants[0].observations.shape[2]
         return np.concatenate([plant.observations.reshape(-1, width) for plant in self.plants])
 

@@ -379,6 +379,82 @@ def bench(
         screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
 
 
+@app.command()
+def train(
+    config: Annotated[Path, typer.Argument(help="YAML file, as in configs/train.")],
+    seeds: Annotated[str, typer.Option(help="Training seeds, parted by commas.")] = "0",
+    robot_steps: Annotated[
+        int | None, typer.Option(help="Control steps times robots, instead of the file's.")
+    ] = None,
+    processes: Annotated[
+        int, typer.Option(help="Seeds at a time on this machine; 0: one per core.")
+    ] = 0,
+    ray: Annotated[
+        str | None, typer.Option(help="Address of an existing Ray cluster to run on instead.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; results/train/CONFIG without it.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the evaluations as JSON instead of the table.")
+    ] = False,
+) -> None:
+    """Train policies, a seed each; interrupt it and call it again to go on to the same result."""
+    from baselines.train_config import load_config
+
+    try:
+        from baselines.train import kept, train_seeds
+    except ModuleNotFoundError as error:
+        raise ValueError(f"training needs {error.name} (pip install 'tlf-env[train]')") from error
+    loaded = load_config(config, robot_steps=robot_steps)
+    numbers = whole_numbers("seeds", seeds)
+    folder = writable_folder(out or Path("results/train") / config.stem)
+    warn_of_compiling()
+    with progress_bar(f"train {config.stem}") as update:
+        curves = train_seeds(
+            loaded,
+            numbers,
+            folder,
+            processes=min(processes or os.cpu_count() or 1, len(numbers)),
+            ray_address=ray,
+            command="tlf " + " ".join(without_places(sys.argv[1:])),
+            progress=update,
+        )
+    if as_json:
+        rows = [
+            {"seed": curve["seed"], "start": curve["evaluations"][0], "kept": kept(curve)}
+            for curve in curves
+        ]
+        typer.echo(json.dumps(rows, indent=1, allow_nan=False))
+        return
+    screen.print(training_table(curves))
+    screen.print(f"In {folder}: policy.safetensors and policy.json of the best, seed_N of each")
+
+
+def training_table(curves: list[dict[str, Any]]) -> Table:
+    """What every seed reached on the choosing seeds."""
+    from baselines.train import kept
+
+    table = Table(
+        title="geometric mean of the worst robot's position RMS in mm, a failed run counts 1000",
+        box=SIMPLE_HEAD,
+    )
+    for name in ("seed", "start", "kept", "failed at start", "failed", "robot steps", "minutes"):
+        table.add_column(name, justify="right")
+    for curve in curves:
+        first, best = curve["evaluations"][0], kept(curve)
+        table.add_row(
+            str(curve["seed"]),
+            f"{first['score_mm']:.2f}",
+            f"{best['score_mm']:.2f}",
+            str(first["failed"]),
+            str(best["failed"]),
+            f"{best['robot_steps']}",
+            f"{curve['wall_time_s'] / 60:.1f}",
+        )
+    return table
+
+
 PLACES = ("--out", "--processes", "--ray")
 
 

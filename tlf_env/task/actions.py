@@ -42,7 +42,8 @@ ACTION_ENTRIES = {
     ),
     "residual": (
         Entry(
-            "forward speed added to what residual_base asks for, before its limits",
+            "forward speed added to what residual_base asks for, before its limits; "
+            "residual_fade_mm fades it out",
             "mm/s",
             FULL_RESIDUAL_MM_S,
         ),
@@ -115,6 +116,20 @@ def reference_action(
     """The reference's ``twist`` action from one ``tracking`` observation."""
     u_1, u_2 = wanted_twist(observation, scales, row)
     return twist_action(observation, scales, row, u_1, u_2)
+
+
+@law
+def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float) -> float:
+    """How much of a residual counts: e²/(e² + fade²) of the estimated error e, both in mm.
+
+    Near its reference a robot is driven by the base alone, which is quieter there than what has
+    learned to correct large errors. Everything counts if ``fade`` is 0.
+    """
+    if fade == 0.0:
+        return 1.0
+    e_1, e_2 = observation[E_1] * scales[E_1], observation[E_2] * scales[E_2]
+    squared = e_1 * e_1 + e_2 * e_2
+    return squared / (squared + fade * fade)
 
 
 @law

@@ -24,6 +24,7 @@ from tlf_env.task.actions import (
     TWIST,
     limited,
     reference_action,
+    residual_share,
     twist_action,
     wanted_twist,
     wheel_command,
@@ -66,8 +67,9 @@ def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
     if kind == RESIDUAL:
         seen, given = a.observations[lane, r], a.twists[lane, r]
         u_1, u_2 = wanted_twist(seen, a.scales, s.base)
-        u_1 += a_0 * FULL_RESIDUAL_MM_S
-        u_2 += a_1 * FULL_RESIDUAL_RAD_S
+        share = residual_share(seen, a.scales, s.residual_fade)
+        u_1 += share * a_0 * FULL_RESIDUAL_MM_S
+        u_2 += share * a_1 * FULL_RESIDUAL_RAD_S
         given[0], given[1] = twist_action(seen, a.scales, s.base, u_1, u_2)
         return wheel_command(given[0], given[1], TWIST, body)
     return wheel_command(a_0, a_1, kind, body)

@@ -39,6 +39,7 @@ class Settings(NamedTuple):
     changing: bool  # whether a channel of every substep varies within an episode
     adversary: bool
     base: ControllerRow  # of the twist that a residual is added to
+    residual_fade: float  # mm; 0 where a residual always counts fully
 
 
 def settings(scenario: Scenario) -> Settings:
@@ -72,4 +73,5 @@ def settings(scenario: Scenario) -> Settings:
         base=controller_row(
             controller(scenario.residual_base), scenario.control_period_s, scenario.preview_s
         ),
+        residual_fade=scenario.residual_fade_mm,
     )

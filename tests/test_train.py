@@ -1,0 +1,234 @@
+"""``tlf train``: goes on to the same result, refuses what it cannot do, beats nobody by accident."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+from pathlib import Path
+
+import pytest
+import yaml
+
+from baselines import load_policy
+from baselines.train_config import load_config
+from tlf_env.cli import main
+from tlf_env.task.scenario import presets_folder
+
+SHORT = {"horizon_s": 2.0, "time_gap_s": 1.0, "preview_s": [0.5]}
+CONFIG = {
+    "algorithm": "PPO",
+    "robot_steps": 600,
+    "formations": 4,
+    "scenario": {"action": "residual", "residual_base": "tuned", "estimator": "ekf-slip", **SHORT},
+    "tasks": {"infinity": {}, "flower": {"robots": 3, "horizon_s": 3.0}},
+    "disturbances": {"nominal": 1, "slip": 2, "combined-hard": 1},
+    "levels": [0.5, 1.0],
+    "network": {"hidden": [16]},
+    "settings": {"n_steps": 10, "batch_size": 40, "n_epochs": 2, "learning_rate": 0.01},
+    "final_learning_rate_share": 0.1,
+    "checkpoint_every": 240,
+    "evaluation": {
+        "every": 360,
+        "seeds": [10_000, 10_002],
+        "disturbances": ["slip"],
+        "horizon_s": 2.0,
+    },
+}
+ALGORITHMS = {
+    "PPO": {},
+    "SAC": {
+        "algorithm": "SAC",
+        "robot_steps": 2400,
+        "checkpoint_every": 768,
+        "settings": {"buffer_size": 2000, "learning_starts": 100, "batch_size": 32},
+    },
+    "RecurrentPPO": {
+        "algorithm": "RecurrentPPO",
+        "network": {"hidden": [8], "lstm": 8},
+        "scenario": {"observation": "sensor", "action": "twist", **SHORT},
+    },
+}
+
+
+@pytest.mark.parametrize("path", sorted((presets_folder() / "train").glob("*.yaml")), ids=str)
+def test_shipped_configs_are_valid(path: Path):
+    config = load_config(path)
+    tasks, shares = config.mixture()
+    assert all(len(scenarios) == len(shares) for scenarios in tasks.values())
+
+
+@pytest.mark.parametrize(
+    ("changes", "said"),
+    [
+        ({"algorithm": "A2C"}, "algorithm: Input should be 'PPO', 'SAC' or 'RecurrentPPO'"),
+        ({"robot_steps": 0}, "robot_steps: Input should be greater than or equal to 1, got 0"),
+        ({"rollouts": 3}, "rollouts: unknown key"),
+        ({"seeds": [0, 20_001]}, "seeds 0:20001 must be a range within 0:10000"),
+        ({"seeds": [5, 5]}, "seeds 5:5 must be a range within 0:10000"),
+        (
+            {"evaluation": {**CONFIG["evaluation"], "seeds": [20_000, 20_050]}},
+            "evaluation seeds 20000:20050 must be a range within 10000:20000",
+        ),
+        ({"disturbances": {"storm": 1}}, "disturbance 'storm' is not one of"),
+        ({"disturbances": {"slip": 0}}, "at least one share must be above 0"),
+        ({"tasks": {"square": {}}}, "scenario 'square' is neither a preset"),
+        ({"tasks": {"infinity": {"speed": 1}}}, "speed: unknown key"),
+        ({"network": {"lstm": 8}}, "network.lstm is for RecurrentPPO and needed there; got 8"),
+        ({"algorithm": "RecurrentPPO"}, "network.lstm is for RecurrentPPO and needed there"),
+        ({"settings": {"seed": 3}}, "settings.seed is set elsewhere"),
+    ],
+)
+def test_a_wrong_config_is_told_in_one_line(changes: dict, said: str):
+    with pytest.raises(ValueError, match=".") as error:
+        load_config({**CONFIG, **changes})
+    assert said in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def command(tmp_path: Path, *words: str, **changes: object) -> list[str]:
+    path = tmp_path / "small.yaml"
+    path.write_text(yaml.safe_dump({**CONFIG, **changes}))
+    return ["tlf", "train", str(path), "--out", str(tmp_path / "out"), *words]
+
+
+def test_without_its_packages_training_says_what_to_install(tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(__import__("sys").modules, "stable_baselines3", None)
+    monkeypatch.delitem(__import__("sys").modules, "baselines.train", raising=False)
+    monkeypatch.setattr("sys.argv", command(tmp_path))
+    with pytest.raises(SystemExit) as ended:
+        main()
+    assert ended.value.code == 2
+    assert "pip install 'tlf-env[train]'" in capsys.readouterr().err
+
+
+class TestTraining:
+    """What needs stable-baselines3, sb3-contrib and torch."""
+
+    @pytest.fixture(autouse=True)
+    def _packages(self):
+        pytest.importorskip("stable_baselines3")
+        pytest.importorskip("sb3_contrib")
+
+    @pytest.mark.parametrize("name", ALGORITHMS)
+    def test_an_interrupted_training_goes_on_to_the_same_policy(self, name, tmp_path):
+        from baselines.train import CHECKPOINT, POLICY, train
+
+        config = load_config({**CONFIG, **ALGORITHMS[name]})
+        whole = train(config, 3, tmp_path / "whole")
+        stops = []
+
+        def interrupt(done: int, total: int) -> None:
+            stops.append(done)
+            if len(stops) in (1, 3):
+                os.kill(os.getpid(), signal.SIGINT)
+
+        parts = tmp_path / "parts"
+        for _ in range(2):
+            with pytest.raises(KeyboardInterrupt):
+                train(config, 3, parts, progress=interrupt)
+            assert (parts / CHECKPOINT).exists()
+        again = train(config, 3, parts)
+        for curve in (whole, again):
+            del curve["wall_time_s"]
+        assert whole == again
+        assert len(whole["evaluations"]) >= 3
+        assert (parts / POLICY).read_bytes() == (tmp_path / "whole" / POLICY).read_bytes()
+        assert (parts / CHECKPOINT).stat().st_size == (
+            tmp_path / "whole" / CHECKPOINT
+        ).stat().st_size
+
+    def test_a_killed_training_goes_on_from_its_last_checkpoint(self, tmp_path):
+        from baselines.train import POLICY, train
+
+        config = load_config(CONFIG)
+
+        def die(done: int, total: int) -> None:
+            if done > 360:  # later than the checkpoint, and than the evaluation
+                raise RuntimeError
+
+        with pytest.raises(RuntimeError):
+            train(config, 3, tmp_path / "parts", progress=die)
+        again = train(config, 3, tmp_path / "parts")
+        whole = train(config, 3, tmp_path / "whole")
+        assert again["evaluations"] == whole["evaluations"]
+        assert again["rollouts"] == whole["rollouts"]
+        assert (tmp_path / "parts" / POLICY).read_bytes() == (
+            tmp_path / "whole" / POLICY
+        ).read_bytes()
+
+    def test_the_first_policy_is_the_reference_and_the_kept_one_the_best(self, tmp_path):
+        from baselines import ReferencePolicy
+        from baselines.train import evaluate, kept, train
+
+        config = load_config({**CONFIG, "network": {"hidden": [16], "action_gain": 1e-9}})
+        curve = train(config, 0, tmp_path)
+        twist = load_config({**CONFIG, "scenario": {**CONFIG["scenario"], "action": "twist"}})
+        reference = evaluate(ReferencePolicy("tuned", preview_s=(0.5,)), twist)
+        for name, cell in curve["evaluations"][0]["cells"].items():
+            assert cell["score_mm"] == pytest.approx(reference[name].score_mm, rel=1e-4)
+        policy = load_policy(tmp_path / "policy.safetensors")
+        assert policy.card.scores["kept"] == kept(curve)
+        assert policy.card.residual_base == "tuned"
+        found = {name: cell._asdict() for name, cell in evaluate(policy, config).items()}
+        for name, cell in kept(curve)["cells"].items():
+            assert found[name]["score_mm"] == pytest.approx(cell["score_mm"], rel=1e-3)
+
+    def test_another_training_in_the_folder_is_refused(self, tmp_path):
+        from baselines.train import train
+
+        train(load_config(CONFIG), 0, tmp_path)
+        with pytest.raises(ValueError, match="holds a training with another seed"):
+            train(load_config(CONFIG), 1, tmp_path)
+        with pytest.raises(ValueError, match="holds a training with another config"):
+            train(load_config(CONFIG, robot_steps=900), 0, tmp_path)
+
+    @pytest.mark.parametrize("damage", ["cut", "text", "other"])
+    def test_a_damaged_checkpoint_is_told_in_one_line(self, damage, tmp_path):
+        from baselines.train import CHECKPOINT, train
+
+        config = load_config(CONFIG)
+        train(config, 0, tmp_path)
+        path = tmp_path / CHECKPOINT
+        if damage == "cut":
+            path.write_bytes(path.read_bytes()[:-100])
+        elif damage == "text":
+            path.write_text("nothing")
+        else:
+            other = load_config({**CONFIG, "network": {"hidden": [8]}})
+            train(other, 0, tmp_path / "other")
+            path.write_bytes((tmp_path / "other" / CHECKPOINT).read_bytes())
+        with pytest.raises(ValueError, match="cannot be gone on from") as error:
+            train(config, 0, tmp_path)
+        assert "\n" not in str(error.value)
+
+    @pytest.mark.parametrize(
+        ("settings", "said"),
+        [
+            ({"n_step": 10}, "settings.n_step is not one of"),
+            ({"n_steps": "many"}, "settings: PPO says"),
+        ],
+    )
+    def test_settings_that_the_algorithm_refuses(self, settings, said, tmp_path):
+        from baselines.train import train
+
+        with pytest.raises(ValueError, match=said):
+            train(load_config({**CONFIG, "settings": settings}), 0, tmp_path)
+
+    @pytest.mark.slow
+    def test_seeds_side_by_side_are_the_seeds_alone(self, tmp_path, monkeypatch, capsys):
+        monkeypatch.setattr("sys.argv", command(tmp_path, "--seeds", "0,1", "--json"))
+        main()
+        rows = json.loads(capsys.readouterr().out)
+        assert [row["seed"] for row in rows] == [0, 1]
+        monkeypatch.setattr(
+            "sys.argv",
+            [*command(tmp_path, "--seeds", "0,1", "--processes", "1", "--json")[:4]]
+            + [str(tmp_path / "alone"), "--seeds", "0,1", "--processes", "1", "--json"],
+        )
+        main()
+        assert json.loads(capsys.readouterr().out) == rows
+        best = min(rows, key=lambda row: row["kept"]["score_mm"])["seed"]
+        for folder in (tmp_path / "out", tmp_path / "alone"):
+            policy = (folder / "policy.safetensors").read_bytes()
+            assert policy == (folder / f"seed_{best}" / "policy.safetensors").read_bytes()
