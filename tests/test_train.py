@@ -80,7 +80,7 @@ def test_shipped_configs_are_valid(path: Path):
     ],
 )
 def test_a_wrong_config_is_told_in_one_line(changes: dict, said: str):
-    with pytest.raises(ValueError, match=".") as error:
+    with pytest.raises(ValueError) as error:  # noqa: PT011 - what it says is checked below
         load_config({**CONFIG, **changes})
     assert said in str(error.value)
     assert "\n" not in str(error.value)
@@ -221,11 +221,9 @@ class TestTraining:
         main()
         rows = json.loads(capsys.readouterr().out)
         assert [row["seed"] for row in rows] == [0, 1]
-        monkeypatch.setattr(
-            "sys.argv",
-            [*command(tmp_path, "--seeds", "0,1", "--processes", "1", "--json")[:4]]
-            + [str(tmp_path / "alone"), "--seeds", "0,1", "--processes", "1", "--json"],
-        )
+        words = command(tmp_path, "--seeds", "0,1", "--processes", "1", "--json")
+        words[words.index("--out") + 1] = str(tmp_path / "alone")
+        monkeypatch.setattr("sys.argv", words)
         main()
         assert json.loads(capsys.readouterr().out) == rows
         best = min(rows, key=lambda row: row["kept"]["score_mm"])["seed"]
