@@ -9,7 +9,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow test-learning check format speed speed-docs constraints clean
+.PHONY: help run test test-slow test-learning check format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -42,6 +42,10 @@ speed: $(VENV)/.stamp-test ## Measure the steps per second, beside a peer
 speed-docs: $(VENV)/.stamp-test ## Measure them for docs/performance.md, and write its tables and figure
 	$(BIN)/tlf speed --out docs/performance.json >/dev/null
 	$(BIN)/python docs/figures/make_speed.py
+
+board: $(VENV)/.stamp-test ## Run the published leaderboard's plan (hours; it resumes), and write its pages
+	$(BIN)/tlf bench --plan board --out results/board
+	$(BIN)/python docs/figures/make_board.py results/board
 
 # torch is fixed by hand (make constraints TORCH=...), and everything else is resolved anew. What
 # torch requires on one kind of machine only is left out.

@@ -18,6 +18,7 @@ from arch.bootstrap import IIDBootstrap, IndependentSamplesBootstrap
 from scipy.stats import binomtest, trim_mean
 
 from baselines.bench import Results
+from baselines.policies import policy_names
 from tlf_env.numerics.files import atomic
 from tlf_env.task.channels import CHANNELS
 
@@ -27,6 +28,11 @@ BOOTSTRAP_SEED = 20_000
 PROFILE_SCORES = np.linspace(0, 100, 101)
 REFERENCES = ("reference:consistent", "reference")  # the same policy
 LOSSES = (0.05, 0.5)
+COMPARED = {  # metric: how a policy is compared with its rival, both at the run's worst robot
+    "position_rmse_mm": "difference",
+    "error_capped_mean_mm": "difference",
+    "torque_rms_Nmm": "ratio",
+}
 
 Stratum = tuple[str, str, float | None]  # task, disturbance, value of the swept knob
 
@@ -72,6 +78,11 @@ def worst(line: dict[str, Any], metric: str) -> float | None:
     return max(values, default=None)
 
 
+def failed(line: dict[str, Any]) -> bool:
+    """Whether a robot is lost or touches another."""
+    return any(robot["lost"] or robot["touched"] for robot in line["robots"])
+
+
 def median(values: Sequence[float | None]) -> dict[str, Any]:
     """Median of what is defined, with its interval; None if nothing is."""
     defined = np.array([value for value in values if value is not None])
@@ -90,14 +101,12 @@ def cell_table(lines: list[dict[str, Any]]) -> dict[str, Any]:
     runs = len(lines)
     lost = sum(any(robot["lost"] for robot in line["robots"]) for line in lines)
     touched = sum(any(robot["touched"] for robot in line["robots"]) for line in lines)
-    failed = sum(
-        any(robot["lost"] or robot["touched"] for robot in line["robots"]) for line in lines
-    )
+    failures = sum(map(failed, lines))
     table: dict[str, Any] = {
         "runs": runs,
         "lost": rate(lost, runs),
         "touched": rate(touched, runs),
-        "success": rate(runs - failed, runs),
+        "success": rate(runs - failures, runs),
     }
     for metric in (
         "position_rmse_mm",
@@ -127,8 +136,19 @@ def stratum_of(line: dict[str, Any]) -> Stratum:
     return line["task"], line["disturbance"], line["sweep"]
 
 
-def leaderboard(results: Results) -> dict[str, Any]:
-    """Everything that the tables and figures show, from the finished lines in the plan's order."""
+def leaderboard(results: Results, command: str = "") -> dict[str, Any]:
+    """Everything that the tables and figures show, from the finished lines in the plan's order.
+
+    Parameters
+    ----------
+    command
+        What made the results, for the tables' first line.
+
+    Raises
+    ------
+    ValueError
+        if policies that are compared have not run the same seeds.
+    """
     groups: dict[str, dict[Stratum, list[dict[str, Any]]]] = {}
     for line in results.ordered():
         groups.setdefault(line["policy"], {}).setdefault(stratum_of(line), []).append(line)
@@ -152,11 +172,13 @@ def leaderboard(results: Results) -> dict[str, Any]:
     ]
     policies.sort(key=lambda row: -row["score"]["iqm"])
     return {
+        "command": command,
         "reference": reference,
         "plan": json.loads((results.folder / "plan.json").read_text(encoding="utf-8")),
         "policies": policies,
         "cells": cells,
         "profiles": {policy: profile(strata) for policy, strata in groups.items()},
+        "comparisons": comparisons(groups, [row["policy"] for row in policies]),
         "breaking_points": breaking_points(results, cells),
     }
 
@@ -175,11 +197,7 @@ def policy_table(
         for mine, other in zip(scores, theirs, strict=False)
         if len(mine) == len(other)
     ]
-    failed = [
-        any(robot["lost"] or robot["touched"] for robot in line["robots"])
-        for lines in strata.values()
-        for line in lines
-    ]
+    failures = [failed(line) for lines in strata.values() for line in lines]
     own = pooled_iqm(*scores)
     return {
         "policy": policy,
@@ -190,12 +208,106 @@ def policy_table(
             for line in lines
             for field, value in line.get("overrides", {}).items()
         },
-        "runs": len(failed),
-        "failed": sum(failed),
+        "runs": len(failures),
+        "failed": sum(failures),
         "score": {"iqm": own, "interval": stratified_interval(scores, pooled_iqm)},
         "normalised_score": own / base if base else None,
         "probability_of_improvement": float(np.mean(better)) if better else None,
     }
+
+
+def comparisons(
+    groups: dict[str, dict[Stratum, list[dict[str, Any]]]], ranked: Sequence[str]
+) -> list[dict[str, Any]]:
+    """Entries against the best of the others, stratum by stratum, on the same seeds.
+
+    Entries are the policies that do not come with the package by name, learned ones for example;
+    where there is none, the first of ``ranked``. Their rival in a stratum is whichever of the
+    others fails least there, and of those with as few failures the one whose median position RMS is
+    least. It is chosen by what is compared, which favours the rival. A privileged policy is no
+    rival.
+
+    Raises
+    ------
+    ValueError
+        if an entry and its rival have not run the same seeds.
+    """
+    known = ("reference", *policy_names())
+    entries = [policy for policy in groups if policy not in known] or list(ranked[:1])
+    others = [
+        policy
+        for policy, strata in groups.items()
+        if policy not in entries
+        and not any(line["privileged"] for lines in strata.values() for line in lines)
+    ]
+    rows = []
+    for entry in entries:
+        for stratum, lines in groups[entry].items():
+            rivals = {name: groups[name][stratum] for name in others if stratum in groups[name]}
+            if rivals:
+                rival = min(rivals, key=lambda name: standing(rivals[name]))
+                rows.append(comparison(lines, rivals[rival]))
+    return rows
+
+
+def standing(lines: Sequence[dict[str, Any]]) -> tuple[int, float]:
+    """What ranks policies in a stratum, less being better: failures, then the median position RMS."""
+    values = [worst(line, "position_rmse_mm") for line in lines]
+    defined = [value for value in values if value is not None]
+    return sum(map(failed, lines)), float(np.median(defined)) if defined else math.inf
+
+
+def comparison(mine: Sequence[dict[str, Any]], theirs: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """How a policy differs from a rival in one stratum.
+
+    Raises
+    ------
+    ValueError
+        if they have not run the same seeds.
+    """
+    other = {line["seed"]: line for line in theirs}
+    if sorted(other) != sorted(line["seed"] for line in mine):
+        place = ", ".join(str(part) for part in stratum_of(mine[0]) if part is not None)
+        raise ValueError(
+            f"{mine[0]['policy']} and {theirs[0]['policy']} have not run the same seeds of {place}"
+        )
+    pairs = [(line, other[line["seed"]]) for line in mine]
+    task, disturbance, swept = stratum_of(mine[0])
+    return {
+        "policy": mine[0]["policy"],
+        "rival": theirs[0]["policy"],
+        "task": task,
+        "disturbance": disturbance,
+        "sweep": swept,
+        "runs": len(pairs),
+        "failed": [sum(map(failed, lines)) for lines in (mine, theirs)],
+        **{
+            metric: paired([(worst(a, metric), worst(b, metric)) for a, b in pairs], how)
+            for metric, how in COMPARED.items()
+        },
+    }
+
+
+def paired(values: Sequence[tuple[float | None, float | None]], how: str) -> dict[str, Any]:
+    """Difference or ratio of two medians; its interval resamples pairs.
+
+    None if no pair is defined, and for a ratio to what is 0.
+    """
+    whole = np.array([pair for pair in values if None not in pair], dtype=np.float64)
+    if not whole.size or (how == "ratio" and not np.all(whole[:, 1] > 0)):
+        return {how: None, "interval": None}
+    statistic = {"difference": _median_difference, "ratio": _median_ratio}[how]
+    return {how: statistic(whole), "interval": interval(whole, statistic)}
+
+
+def _median_difference(pairs: np.ndarray) -> float:
+    mine, theirs = np.median(pairs, axis=0)
+    return float(mine - theirs)
+
+
+def _median_ratio(pairs: np.ndarray) -> float:
+    mine, theirs = np.median(pairs, axis=0)
+    return float(mine / theirs)
 
 
 def pooled_iqm(*strata: np.ndarray) -> float:
@@ -258,26 +370,43 @@ def crossing(values: Sequence[float], shares: Sequence[float], level: float) -> 
     return None
 
 
-def write_leaderboard(results: Results, folder: Path, command: str) -> dict[str, Any]:
-    """Write ``leaderboard.json`` and ``leaderboard.md``; returns what the first holds."""
-    board = leaderboard(results)
+def write_leaderboard(
+    results: Results,
+    folder: Path,
+    command: str,
+    draw: Callable[[dict[str, Any], Path], Sequence[Path]] | None = None,
+) -> dict[str, Any]:
+    """Write ``leaderboard.json`` and ``leaderboard.md``; returns what the first holds.
+
+    Parameters
+    ----------
+    draw
+        Writes figures into the folder and returns their paths; the page shows them.
+
+    Raises
+    ------
+    ValueError
+        as :func:`leaderboard` does.
+    """
+    board = leaderboard(results, command)
     with atomic(folder / "leaderboard.json", encoding="utf-8") as file:
         json.dump(board, file, indent=1, allow_nan=False)
         file.write("\n")
+    figures = [path.name for path in draw(board, folder)] if draw else []
     with atomic(folder / "leaderboard.md", encoding="utf-8") as file:
-        file.write(markdown(board, command))
+        file.write(markdown(board, figures))
     return board
 
 
-def markdown(board: dict[str, Any], command: str) -> str:
-    """The tables as Markdown."""
+def markdown(board: dict[str, Any], figures: Sequence[str] = ()) -> str:
+    """The tables as Markdown, and links to figures."""
     plan = board["plan"]["plan"]
     first, end = plan["seeds"]
     parts = [
         "# Leaderboard\n",
-        f"Made by `{command}`: seeds {first} to {end - 1}, the same draws for every policy. "
+        f"Made by `{board['command']}`: seeds {first} to {end - 1}, the same draws for every policy. "
         "Intervals are 95 %, by stratified bootstrap (shares: Wilson). A run fails if a robot is lost or "
-        "touches another. Definitions: `docs/metrics.md`.\n",
+        "touches another. Definitions: `docs/metrics.md`, `docs/benchmark.md`.\n",
         "## Over all tasks and disturbances\n",
         "| policy | score (IQM) | interval | normalised | better than the reference | failed |",
         "|---|---:|---:|---:|---:|---:|",
@@ -289,6 +418,7 @@ def markdown(board: dict[str, Any], command: str) -> str:
         for row in board["policies"]
     ]
     parts.append("")
+    parts += comparison_tables(board)
     tasks = dict.fromkeys(cell["task"] for cell in board["cells"])
     for task in tasks:
         parts += task_tables(board, task)
@@ -305,7 +435,75 @@ def markdown(board: dict[str, Any], command: str) -> str:
             for row in board["breaking_points"]
         ]
         parts.append("")
+    if figures:
+        parts.append("## Figures\n")
+        parts += [f"![{figure_title(name)}]({name})\n" for name in figures]
     return "\n".join(parts)
+
+
+def figure_title(name: str) -> str:
+    """What a figure shows, from its file's name: ``leaderboard/scores.png`` → ``Scores``."""
+    return Path(name).stem.replace("_", " ").capitalize()
+
+
+def comparison_tables(board: dict[str, Any]) -> list[str]:
+    """Every entry against the best of the others: a sentence, and a row per task and disturbance."""
+    parts = []
+    for policy in dict.fromkeys(row["policy"] for row in board["comparisons"]):
+        rows = [row for row in board["comparisons"] if row["policy"] == policy]
+        parts += [
+            f"## {policy} against the best of the others\n",
+            "In each row against whichever of the others fails least there, then by its position RMS. "
+            "Differences of medians over seeds (the entry's minus the rival's, worst robot; "
+            "torque: their ratio); intervals resample seeds, of both policies together. "
+            "**Bold**: the interval excludes no difference.\n",
+            f"Position RMS: {verdict(rows)}.\n",
+            "| task | disturbance | rival | failed | rival failed | position RMS, difference mm | "
+            "capped mean, difference mm | torque RMS, ratio |",
+            "|---|---|---|---:|---:|---:|---:|---:|",
+        ]
+        parts += [
+            f"| {row['task']} | {stratum_name(row)} | {row['rival']} | {row['failed'][0]} of {row['runs']} | "
+            f"{row['failed'][1]} of {row['runs']} | {compared(row['position_rmse_mm'], 2)} | "
+            f"{compared(row['error_capped_mean_mm'], 2)} | {compared(row['torque_rms_Nmm'], 3)} |"
+            for row in rows
+        ]
+        parts.append("")
+    return parts
+
+
+def stratum_name(row: dict[str, Any]) -> str:
+    """A disturbance, with the value of a swept knob."""
+    return row["disturbance"] + ("" if row["sweep"] is None else f" = {row['sweep']:g}")
+
+
+def sign(found: dict[str, Any], equal: float) -> int:
+    """Whether an interval lies below (-1) or above (1) what stands for no difference; else 0."""
+    ends = found["interval"]
+    if ends is None:
+        return 0
+    return int(ends[0] > equal) - int(ends[1] < equal)
+
+
+def verdict(rows: Sequence[dict[str, Any]]) -> str:
+    """In how many strata the position RMS is smaller, larger, or not told apart."""
+    signs = [sign(row["position_rmse_mm"], 0.0) for row in rows]
+    return (
+        f"smaller in {signs.count(-1)} of {len(rows)} rows, larger in {signs.count(1)}, "
+        f"not told apart in {signs.count(0)}"
+    )
+
+
+def compared(found: dict[str, Any], digits: int) -> str:
+    """A difference or a ratio with its interval, bold if that excludes no difference."""
+    ratio = "ratio" in found
+    value = found["ratio" if ratio else "difference"]
+    text = number(value, digits)
+    if value is not None and value > 0 and not ratio:
+        text = f"+{text}"
+    if sign(found, 1.0 if ratio else 0.0):
+        text = f"**{text}**"
+    return f"{text} {span(found['interval'], digits)}".strip()
 
 
 def task_tables(board: dict[str, Any], task: str) -> list[str]:
@@ -321,7 +519,6 @@ def task_tables(board: dict[str, Any], task: str) -> list[str]:
     for cell in board["cells"]:
         if cell["task"] != task:
             continue
-        knob = "" if cell["sweep"] is None else f" = {cell['sweep']:g}"
         figures = [
             f"{number(cell[metric]['median'], digits)} {span(cell[metric]['interval'], digits)}"
             for metric, digits in (
@@ -331,7 +528,7 @@ def task_tables(board: dict[str, Any], task: str) -> list[str]:
             )
         ]
         parts.append(
-            f"| {cell['disturbance']}{knob} | {title(cell)} | {cell['lost']['count']} of {cell['runs']} "
+            f"| {stratum_name(cell)} | {title(cell)} | {cell['lost']['count']} of {cell['runs']} "
             f"{span([100 * x for x in cell['lost']['interval']], 0)} % | {cell['touched']['count']} | "
             f"{' | '.join(figures)} | {number(cell['torque_rms_Nmm']['median'], 1)} | "
             f"{cell['score']['iqm']:.1f} {span(cell['score']['interval'], 1)} |"

@@ -13,7 +13,7 @@ import inspect
 import json
 import os
 import subprocess
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
 from pathlib import Path
@@ -27,7 +27,13 @@ from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.files import atomic
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import Policy
-from tlf_env.task.scenario import Scenario, load_scenario, preset_names, presets_folder
+from tlf_env.task.scenario import (
+    Scenario,
+    load_scenario,
+    preset_names,
+    presets_folder,
+    read_yaml,
+)
 
 RUNS, PLAN = "runs.jsonl", "plan.json"
 FIRST_TABLE_SEED = 20_000
@@ -147,6 +153,39 @@ def parse_seeds(text: str) -> tuple[int, int]:
     if not (first.isdecimal() and end.isdecimal() and int(first) < int(end)):
         raise ValueError(f"seeds {text!r} must be FIRST:END, e.g. 20000:20050")
     return int(first), int(end)
+
+
+def read_plan(name: str, fields: Collection[str]) -> dict[str, Any]:
+    """The options of `tlf bench` that a plan sets, as they stand on a command line.
+
+    Parameters
+    ----------
+    name
+        A plan's name (``board``) or a YAML file, which maps options to values; a list stands for names
+        parted by commas.
+    fields
+        Options that a plan may set.
+
+    Raises
+    ------
+    ValueError
+        for a plan that there is not, and for another field or a value of no use.
+    """
+    folder = presets_folder() / "plans"
+    is_file = Path(name).suffix in (".yaml", ".yml")
+    if not is_file and name not in preset_names(folder):
+        raise ValueError(
+            f"plan {name!r} is neither one of {', '.join(preset_names(folder))} nor a .yaml file"
+        )
+    found = read_yaml(Path(name) if is_file else folder / f"{name}.yaml")
+    options = {}
+    for field, value in found.items():
+        if field not in fields:
+            raise ValueError(f"plan {name!r} has {field!r}; a plan has {', '.join(sorted(fields))}")
+        options[field] = ",".join(map(str, value)) if isinstance(value, list) else value
+        if not isinstance(options[field], str | int | float):
+            raise ValueError(f"plan {name!r}: {field} must be a text, a number or a list")
+    return options
 
 
 def disturbance_presets() -> list[str]:

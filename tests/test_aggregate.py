@@ -8,7 +8,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 pytest.importorskip("arch")
@@ -180,7 +180,117 @@ def test_the_tables_are_whole_markdown_and_strict_json(tmp_path):
         assert words not in table
     rows = [row for row in table.splitlines() if row.startswith("|")]
     assert {row.count("|") for row in rows if "of 2 [" in row} == {10}
-    assert {row.count("|") for row in rows if "of 2 |" in row} == {7}
+    assert {row.count("|") for row in rows if "of 2 |" in row} == {7, 9}
+
+
+def runs(policy, errors_mm, **robot):
+    return [
+        line(policy, seed, position_rmse_mm=error_mm, **robot)
+        for seed, error_mm in enumerate(errors_mm)
+    ]
+
+
+def test_a_paired_interval_is_narrow_where_seeds_explain_the_spread():
+    rng = np.random.default_rng(1)
+    seeds = rng.normal(50, 20, 60)
+    theirs, mine = seeds, seeds - 2 + rng.normal(0, 0.1, 60)
+    row = aggregate.comparison(runs("mine", mine), runs("theirs", theirs))
+    found = row["position_rmse_mm"]
+    assert found["difference"] == pytest.approx(np.median(mine) - np.median(theirs))
+    assert found["interval"][0] < -2 < found["interval"][1] < 0
+    assert found["interval"][1] - found["interval"][0] < 1
+    shuffled = aggregate.comparison(runs("mine", rng.permutation(mine)), runs("theirs", theirs))
+    low, high = shuffled["position_rmse_mm"]["interval"]
+    assert low < 0 < high
+    assert high - low > 5
+
+
+@settings(max_examples=5, deadline=None)
+@given(shift=st.floats(0.5, 50), n=st.integers(5, 30))
+def test_a_difference_has_the_sign_of_the_shift_and_turns_with_the_policies(shift, n):
+    theirs = np.linspace(10, 20, n)
+    better, worse = (
+        aggregate.comparison(*pair)["position_rmse_mm"]
+        for pair in (
+            (runs("a", theirs - shift), runs("b", theirs)),
+            (runs("b", theirs), runs("a", theirs - shift)),
+        )
+    )
+    assert better["difference"] == pytest.approx(-shift)
+    assert better["interval"] == pytest.approx([-shift, -shift])
+    assert worse["interval"] == pytest.approx([shift, shift])
+    assert (aggregate.sign(better, 0), aggregate.sign(worse, 0)) == (-1, 1)
+
+
+def test_torque_is_compared_by_its_ratio():
+    pair = [runs(name, range(4), torque_rms_Nmm=t) for name, t in (("a", 6.0), ("b", 5.0))]
+    found = aggregate.comparison(*pair)["torque_rms_Nmm"]
+    assert found == {"ratio": pytest.approx(1.2), "interval": pytest.approx([1.2, 1.2])}
+    assert aggregate.compared(found, 2) == "**1.20** [1.20, 1.20]"
+    assert aggregate.paired([(0.0, 0.0)] * 3, "ratio") == {"ratio": None, "interval": None}
+
+
+def test_pairs_that_are_undefined_on_one_side_are_left_out():
+    found = aggregate.paired([(None, 1.0), (1.0, None), (3.0, 1.0), (3.0, 1.0)], "difference")
+    assert found == {"difference": 2, "interval": [2, 2]}
+    assert aggregate.paired([(None, 1.0)], "ratio") == {"ratio": None, "interval": None}
+    assert aggregate.compared({"ratio": None, "interval": None}, 2) == "–"
+
+
+def test_what_cannot_be_told_apart_is_not_bold():
+    assert aggregate.compared({"difference": 0.5, "interval": [-0.1, 1.0]}, 1) == "+0.5 [-0.1, 1.0]"
+    assert aggregate.sign({"difference": 1.0, "interval": None}, 0.0) == 0
+
+
+def test_an_entry_meets_the_rival_that_fails_least_and_then_errs_least(tmp_path, monkeypatch):
+    monkeypatch.setattr(aggregate, "REPEATS", 100)
+    lines = [
+        *runs("learned", (5.0, 6.0)),
+        *runs("pure_pursuit", (1.0, 2.0), touched=True),
+        *runs("reference:tuned", (7.0, 9.0)),
+        *runs("feedback_linearisation", (8.0, 9.0)),
+        *runs("oracle", (0.1, 0.1)),
+    ]
+    board = aggregate.leaderboard(results(lines, tmp_path))
+    rows = {row["policy"]: row for row in board["comparisons"]}
+    assert set(rows) == {"learned", "oracle"}
+    assert rows["learned"]["rival"] == rows["oracle"]["rival"] == "reference:tuned"
+    assert rows["learned"]["failed"] == [0, 0]
+    table = "\n".join(aggregate.comparison_tables(board))
+    assert "smaller in 1 of 1 rows, larger in 0, not told apart in 0" in table
+
+
+def test_without_an_entry_the_first_by_score_meets_the_others(tmp_path, monkeypatch):
+    monkeypatch.setattr(aggregate, "REPEATS", 100)
+    lines = [
+        line(policy, seed, score=score)
+        for seed in range(2)
+        for policy, score in (("pure_pursuit", 30.0), ("reference", 60.0))
+    ]
+    (row,) = aggregate.leaderboard(results(lines, tmp_path))["comparisons"]
+    assert (row["policy"], row["rival"]) == ("reference", "pure_pursuit")
+
+
+def test_a_single_policy_is_compared_with_nothing(tmp_path):
+    board = aggregate.leaderboard(results([line(), line(seed=1)], tmp_path))
+    assert board["comparisons"] == []
+
+
+def test_other_seeds_cannot_be_paired(tmp_path):
+    lines = [*runs("learned", (1.0, 2.0)), *runs("pure_pursuit", (1.0, 2.0, 3.0))]
+    with pytest.raises(ValueError, match="not run the same seeds of infinity, nominal"):
+        aggregate.leaderboard(results(lines, tmp_path))
+
+
+def test_the_page_shows_the_figures_that_were_drawn(tmp_path):
+    def draw(board, folder):
+        return [folder / "scores.png"]
+
+    for drawn, shown in ((draw, True), (None, False), (lambda board, folder: [], False)):
+        aggregate.write_leaderboard(results([line()], tmp_path), tmp_path, "tlf bench", drawn)
+        page = (tmp_path / "leaderboard.md").read_text()
+        assert ("![Scores](scores.png)" in page) == shown
+        assert "Made by `tlf bench`" in page
 
 
 def test_what_is_undefined_is_a_dash():

@@ -306,12 +306,20 @@ def test_seeds_of_another_form_are_told(text):
         ("--level -1", "level"),
         ("--horizon-s 0.03", "horizon_s"),
         ("--processes -1", "processes"),
+        ("--plan no_such", "neither one of board nor a .yaml file"),
+        ("--plan no_such.yaml", "no_such.yaml"),
+        ("--plan trusting.yaml", "'trust'"),
+        ("--plan nested.yaml", "seeds must be a text, a number or a list"),
+        ("--plan wordy.yaml", "--horizon-s"),
     ],
 )
 def test_bad_input_is_one_line_and_writes_nothing(words, said, tmp_path, monkeypatch, capsys):
     (tmp_path / "sensor.yaml").write_text(
         "observation: sensor\ntrajectory: {type: circle, radius_mm: 800, speed_mm_s: 200}\n"
     )
+    (tmp_path / "trusting.yaml").write_text("trust: true\n")
+    (tmp_path / "nested.yaml").write_text("seeds: {first: 1}\n")
+    (tmp_path / "wordy.yaml").write_text("horizon_s: long\n")
     monkeypatch.chdir(tmp_path)
     defaults = {"--policies": "pure_pursuit", "--tasks": "infinity", "--disturbances": "nominal"}
     for name, value in defaults.items():
@@ -325,6 +333,20 @@ def test_bad_input_is_one_line_and_writes_nothing(words, said, tmp_path, monkeyp
     assert "\n" not in told.strip()
     assert said in told
     assert not list((tmp_path / "out").glob("*"))
+
+
+def test_an_option_stands_above_the_plan(tmp_path, monkeypatch):
+    (tmp_path / "plan.yaml").write_text(
+        "policies: [pure_pursuit, feedback_linearisation]\ntasks: infinity\n"
+        'disturbances: nominal\nseeds: "3:4"\nhorizon_s: 2\n'
+    )
+    monkeypatch.chdir(tmp_path)
+    words = "bench --plan plan.yaml --seeds 5:6 --processes 1 --no-figures --out out"
+    monkeypatch.setattr(sys, "argv", ["tlf", *words.split()])
+    main()
+    plan = json.loads((tmp_path / "out/plan.json").read_text())["plan"]
+    assert plan["policies"] == ["pure_pursuit", "feedback_linearisation"]
+    assert (plan["seeds"], plan["overrides"]) == ([5, 6], [["horizon_s", 2.0]])
 
 
 def test_a_bench_without_arch_says_so_before_it_runs(tmp_path, monkeypatch):

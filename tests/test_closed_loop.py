@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 from helpers import TAIL_FROM, Run, drive
 
+from baselines import ReferencePolicy
 from baselines.policies import enter
 from baselines.run import run_policy
 from tlf_env.onboard.tracking import TrackingGains
@@ -109,6 +110,21 @@ def test_infinity_with_more_heading_damping():
 def test_flower_with_more_heading_damping():
     run = drive("flower", TrackingGains(k_2_mm2_s=2 * 12e3))
     assert_within(run, (0.6, 0.4, 0.4, 0.4, 0.5))
+
+
+@pytest.mark.parametrize(("slip", "table_mm"), [("delta_1_mm_s", 18), ("delta_2_rad_s", 10)])
+def test_constant_slip_with_the_true_pose_costs_what_it_did_in_the_study(slip, table_mm):
+    """k₂ = 2·k₃, 5 mm/s or 0.2 rad/s. With k₂ = 0.83·k₃ each loses a robot."""
+    amount = {"delta_1_mm_s": 5.0, "delta_2_rad_s": 0.2}[slip]
+    given = {"disturbance": {"slip": {slip: amount}}, "estimator": "truth", "horizon_s": 60.0}
+    scenario = load_scenario("infinity", plant="batch", **given)
+    worst_mm = {}
+    for ratio in (2.0, 0.83):
+        policy = ReferencePolicy(TrackingGains(k_2_mm2_s=ratio * 12e3))
+        error_mm = run_policy(scenario, policy, 20_000)["position_error_mm"]
+        worst_mm[ratio] = np.sqrt(np.mean(error_mm[2100:] ** 2, axis=0)).max()
+    assert worst_mm[2.0] == pytest.approx(table_mm, rel=0.1)
+    assert worst_mm[0.83] > 100
 
 
 # At 50 ms

@@ -303,6 +303,26 @@ def speed_table(result: dict[str, Any]) -> Table:
     return table
 
 
+PLAN_OPTIONS = frozenset(
+    ("policies", "tasks", "disturbances", "seeds", "level", "sweep", "horizon_s", "plant")
+)
+
+
+def take_plan(ctx: typer.Context, plan: str | None) -> str | None:
+    """Make a plan's values the defaults of the other options, which stand above it where given.
+
+    Raises
+    ------
+    ValueError
+        for a plan that there is not, a field that is no option of a plan, or a value of no use.
+    """
+    from baselines.bench import read_plan
+
+    if plan is not None:
+        ctx.default_map = read_plan(plan, PLAN_OPTIONS)
+    return plan
+
+
 @app.command()
 def bench(
     policies: Annotated[
@@ -332,6 +352,14 @@ def bench(
     trust: Annotated[
         bool, typer.Option("--trust", help="Load SB3 .zip files, which runs code in them.")
     ] = False,
+    plan: Annotated[
+        str | None,
+        typer.Option(
+            help="Take the options above from a plan, board or FILE.yaml; what is given stands.",
+            is_eager=True,
+            callback=take_plan,
+        ),
+    ] = None,
     out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("results/bench"),
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
     as_json: Annotated[
@@ -342,7 +370,7 @@ def bench(
     from baselines.bench import Plan, disturbance_presets, parse_seeds, parse_sweep, run_bench
 
     path, values = parse_sweep(sweep) if sweep else (None, ())
-    plan = Plan(
+    asked = Plan(
         policies=listed(policies),
         tasks=listed(tasks),
         disturbances=tuple(disturbance_presets())
@@ -361,7 +389,7 @@ def bench(
     )
     with progress_bar("bench") as update:
         results = run_bench(
-            plan,
+            asked,
             out,
             processes=processes or os.cpu_count() or 1,
             ray_address=ray,
@@ -369,9 +397,8 @@ def bench(
         )
     from baselines.aggregate import write_leaderboard
 
-    board = write_leaderboard(results, out, "tlf " + " ".join(without_places(sys.argv[1:])))
-    if figures:
-        draw_bench(board, out)
+    command = "tlf " + " ".join(without_places(sys.argv[1:]))
+    board = write_leaderboard(results, out, command, draw_bench if figures else None)
     if as_json:
         typer.echo(json.dumps(board, indent=1, allow_nan=False))
     else:
@@ -484,14 +511,14 @@ def listed(text: str) -> tuple[str, ...]:
     return names
 
 
-def draw_bench(board: dict[str, Any], folder: Path) -> None:
-    """The benchmark's figures, or a hint where matplotlib is missing."""
+def draw_bench(board: dict[str, Any], folder: Path) -> list[Path]:
+    """The benchmark's figures, or none and a hint where matplotlib is missing."""
     try:
         from baselines.bench_figures import write_bench_figures
     except ModuleNotFoundError as error:
         notes.print(f"No figures: {error.name} is missing (pip install 'tlf-env[figures]').")
-        return
-    write_bench_figures(board, folder)
+        return []
+    return write_bench_figures(board, folder)
 
 
 def board_table(board: dict[str, Any]) -> Table:
