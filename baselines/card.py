@@ -84,7 +84,8 @@ class Card(Frozen):
     preview_s: tuple[NonNegative, ...]  # () for sensor, which has none
     control_period_s: Positive
     residual_base: Word | None = None  # gains that a residual is added to
-    residual_fade_mm: NonNegative = 0.0  # estimated error at which the residual counts half
+    residual_fade_mm: NonNegative = 0.0  # estimated errors at which the residual counts half
+    residual_reach_mm: Positive | None = None
     estimator: Word | None = None  # None: whatever the scenario has
 
     network: Network
@@ -146,14 +147,16 @@ class Loaded(NamedTuple):
 def interface(scenario: Scenario) -> dict[str, Any]:
     """The fields of a card that a scenario fixes."""
     tracking = scenario.observation == "tracking"
+    residual = scenario.action == "residual"
     entries = (
         tracking_entries(scenario.preview_s) if tracking else sensor_entries(scenario.substeps)
     )
     return {
         "control_period_s": scenario.control_period_s,
         "action": scenario.action,
-        "residual_base": scenario.residual_base if scenario.action == "residual" else None,
-        "residual_fade_mm": scenario.residual_fade_mm if scenario.action == "residual" else 0.0,
+        "residual_base": scenario.residual_base if residual else None,
+        "residual_fade_mm": scenario.residual_fade_mm if residual else 0.0,
+        "residual_reach_mm": scenario.residual_reach_mm if residual else None,
         "estimator": scenario.estimator,
         "observation": scenario.observation,
         "preview_s": scenario.preview_s if tracking else (),

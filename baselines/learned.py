@@ -103,6 +103,7 @@ class LearnedPolicy:
         asked |= {"residual_base": card.residual_base, "estimator": card.estimator}
         if card.residual_fade_mm:
             asked["residual_fade_mm"] = card.residual_fade_mm
+        asked["residual_reach_mm"] = card.residual_reach_mm
         if card.observation == "tracking":
             asked["preview_s"] = card.preview_s
         self.scenario_overrides = {

@@ -26,6 +26,7 @@ OVERRIDABLE = (
     "observation",
     "residual_base",
     "residual_fade_mm",
+    "residual_reach_mm",
     "estimator",
     "preview_s",
 )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from tlf_env.numerics.compiled import law
@@ -43,7 +45,7 @@ ACTION_ENTRIES = {
     "residual": (
         Entry(
             "forward speed added to what residual_base asks for, before its limits; "
-            "residual_fade_mm fades it out",
+            "residual_fade_mm and residual_reach_mm fade it out",
             "mm/s",
             FULL_RESIDUAL_MM_S,
         ),
@@ -119,17 +121,20 @@ def reference_action(
 
 
 @law
-def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float) -> float:
-    """How much of a residual counts: e²/(e² + fade²) of the estimated error e, both in mm.
+def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float, reach: float) -> float:
+    """How much of a residual counts at the estimated error e: e²/(e² + fade²) · 1/(1 + (e/reach)⁴); mm.
 
-    Near its reference a robot is driven by the base alone, which is quieter there than what has
-    learned to correct large errors. Everything counts if ``fade`` is 0.
+    Near its reference and far from it a robot is driven by the base alone: near, that is quieter than
+    what has learned to correct errors, and far, it is known to come back. Everything counts if
+    ``fade`` is 0 and ``reach`` infinite.
     """
-    if fade == 0.0:
+    if fade == 0.0 and reach == math.inf:
         return 1.0
     e_1, e_2 = observation[E_1] * scales[E_1], observation[E_2] * scales[E_2]
     squared = e_1 * e_1 + e_2 * e_2
-    return squared / (squared + fade * fade)
+    near = 1.0 if fade == 0.0 else squared / (squared + fade * fade)
+    far = squared / (reach * reach)
+    return near / (1.0 + far * far)
 
 
 @law

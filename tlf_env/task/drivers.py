@@ -67,7 +67,7 @@ def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
     if kind == RESIDUAL:
         seen, given = a.observations[lane, r], a.twists[lane, r]
         u_1, u_2 = wanted_twist(seen, a.scales, s.base)
-        share = residual_share(seen, a.scales, s.residual_fade)
+        share = residual_share(seen, a.scales, s.residual_fade, s.residual_reach)
         u_1 += share * a_0 * FULL_RESIDUAL_MM_S
         u_2 += share * a_1 * FULL_RESIDUAL_RAD_S
         given[0], given[1] = twist_action(seen, a.scales, s.base, u_1, u_2)

@@ -8,11 +8,13 @@ from typing import NamedTuple
 from tlf_env.numerics.compiled import law
 
 SLIP_UNIT_MM_S = 100.0
+FAR_MM = 1000.0
 
 
 class RewardTerms(NamedTuple):
     """Unweighted terms of one robot and one step; see :data:`REWARD_MEANINGS`."""
 
+    far: float
     coarse: float
     medium: float
     fine: float
@@ -24,7 +26,8 @@ class RewardTerms(NamedTuple):
 
 
 REWARD_MEANINGS = {
-    "coarse": "e^(−e/100 mm), e the true position error to the robot's own reference",
+    "far": "e/1000 mm, e the true position error to the robot's own reference",
+    "coarse": "e^(−e/100 mm)",
     "medium": "e^(−e/10 mm)",
     "fine": "e^(−e/2 mm)",
     "action_change": "|Δa|², a in units of the action space",
@@ -34,7 +37,7 @@ REWARD_MEANINGS = {
     "touched": "1 in the step in which it first touches another",
 }
 
-DEFAULT_WEIGHTS = RewardTerms(0.5, 0.5, 0.5, -0.02, -0.005, -0.05, -20.0, -20.0)
+DEFAULT_WEIGHTS = RewardTerms(0.0, 0.5, 0.5, 0.5, -0.02, -0.005, -0.05, -20.0, -20.0)
 
 
 @law
@@ -43,6 +46,7 @@ def reward_terms(
 ) -> RewardTerms:
     """The terms for a position error in mm, |Δa|², |a|², and a slip speed in mm/s."""
     return RewardTerms(
+        error / FAR_MM,
         math.exp(-error / 100.0),
         math.exp(-error / 10.0),
         math.exp(-error / 2.0),

@@ -128,9 +128,10 @@ class Scenario(Frozen):
 
     action: Literal["twist", "wheel_speed", "torque", "residual"] = "twist"
     residual_base: str = "consistent"  # controller that a residual is added to, a preset
-    residual_fade_mm: NonNegative = (
-        0.0  # estimated error at which a residual counts half; 0: always
-    )
+    # Estimated errors at which a residual counts half: it fades out below the first and beyond the
+    # second. 0 and None: it does not.
+    residual_fade_mm: NonNegative = 0.0
+    residual_reach_mm: Positive | None = None
     observation: Literal["tracking", "sensor"] = "tracking"
     dtype: Literal["float32", "float64"] = "float32"  # of observations and actions
     preview_s: tuple[NonNegative, ...] = DEFAULT_PREVIEW_S

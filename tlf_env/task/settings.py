@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from tlf_env.onboard.observer import ObserverParameters
@@ -39,7 +40,8 @@ class Settings(NamedTuple):
     changing: bool  # whether a channel of every substep varies within an episode
     adversary: bool
     base: ControllerRow  # of the twist that a residual is added to
-    residual_fade: float  # mm; 0 where a residual always counts fully
+    residual_fade: float  # mm; 0 where a residual counts fully near the reference
+    residual_reach: float  # mm; infinity where it does far from it
 
 
 def settings(scenario: Scenario) -> Settings:
@@ -74,4 +76,5 @@ def settings(scenario: Scenario) -> Settings:
             controller(scenario.residual_base), scenario.control_period_s, scenario.preview_s
         ),
         residual_fade=scenario.residual_fade_mm,
+        residual_reach=scenario.residual_reach_mm or math.inf,
     )
