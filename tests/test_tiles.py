@@ -37,6 +37,7 @@ from tlf_env.task.arrays import (
     write_sensors,
     write_trace,
 )
+from tlf_env.task.excerpt import empty_excerpt
 from tlf_env.task.formation import reference_table
 from tlf_env.task.settings import Settings, settings
 from tlf_env.task.substeps import (
@@ -102,7 +103,8 @@ def step_all(a: Arrays, s: Settings, *bounds: int) -> Arrays:
     for _ in range(3):
         a.actions[:] = actions
         for first, last in zip((0, *bounds), (*bounds, len(a.seeds)), strict=True):
-            assert drivers.control_step(a, first, last, s) == drivers.DONE
+            left, nothing = drivers.lanes_to_step(first, last), empty_excerpt(a, 0, 0)
+            assert drivers.control_step(a, left, nothing, s) == drivers.DONE
     return a
 
 

@@ -136,6 +136,26 @@ def test_normalised_observations_are_those_of_single_environments():
         assert np.array_equal(mine.step(action)[0], theirs.step(action)[0])
 
 
+def test_threads_change_nothing_that_is_returned():
+    envs = [
+        vector(50, AutoresetMode.SAME_STEP, horizon_s=0.2, threads=threads) for threads in (1, 3)
+    ]
+    for env in envs:
+        env.reset(seed=0)
+    for action in actions(50, 25):
+        (mine, *rest, infos), (theirs, *their_rest, their_infos) = (
+            env.step(action) for env in envs
+        )
+        assert np.array_equal(mine, theirs)
+        for a, b in zip(rest, their_rest, strict=True):
+            assert np.array_equal(a, b)
+        assert infos.keys() == their_infos.keys()
+        for key in ("x_mm", "clipped", "lost", "touched", "end"):
+            assert np.array_equal(infos[key], their_infos[key]), key
+        for key, values in infos["reward"].items():
+            assert np.array_equal(values, their_infos["reward"][key]), key
+
+
 def test_a_returned_observation_is_not_overwritten():
     env = vector()
     seen, _ = env.reset(seed=0)

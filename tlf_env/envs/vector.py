@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
@@ -13,15 +13,36 @@ from gymnasium.vector.utils import batch_space
 
 from tlf_env.envs.parallel import start_options
 from tlf_env.envs.single import BY_REFERENCE
+from tlf_env.task import judging
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE
 from tlf_env.task.arrays import END_REASONS, Info
 from tlf_env.task.batch import BatchPlant
 from tlf_env.task.channels import PATHS
+from tlf_env.task.excerpt import APPLIED, END, LOST, REWARD, TERMS, TOUCHED, Excerpt
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario
 
 RESET_MASK = "reset_mask"
+REASONS = np.array(END_REASONS)
+
+
+class Names(NamedTuple):
+    """Keys of Gymnasium's infos, and of the masks that tell where each is."""
+
+    keys: tuple[str, ...]
+    masks: tuple[str, ...]
+
+
+INFO, REWARDS, DISTURBANCE, OTHERS = (
+    Names(tuple(keys), tuple(f"_{key}" for key in keys))
+    for keys in (
+        Info._fields,
+        RewardTerms._fields,
+        PATHS,
+        ("reward", "disturbance", "lost", "touched"),
+    )
+)
 
 
 class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -136,7 +157,9 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             mask = ~begun if mask is None else mask & ~begun
         self.plant.reset(seed, mask)
         self._over &= ~(np.ones_like(begun) if mask is None else mask | begun)
-        return self._observations(), self._infos()
+        seen = self.plant.excerpt(self._robot)
+        self.plant.write_excerpt(seen)
+        return seen.observations, self._infos(seen)
 
     def step(
         self, actions: np.ndarray
@@ -163,22 +186,23 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
                 f"sub-environment {np.flatnonzero(self._over)[0]} ended: reset() it before step()"
             )
         self._actions[:, self._robot] = given
-        begun = self._over.copy()
-        self.plant.step(self._actions)
+        begun = self._over
+        seen = self.plant.excerpt(self._robot)
+        self.plant.step(self._actions, seen)
+        rewards = seen.numbers[REWARD, : self.num_envs]
         if begun.any():  # they have been started, and stand at their start again
             self.plant.restart(begun)
-        rewards = np.where(begun, 0.0, self.plant.rewards[:, self._robot])
-        terminated = self.plant.terminated[:, self._robot] & ~begun
-        truncated = self.plant.truncated[:, self._robot] & ~begun
+            self.plant.write_excerpt(seen, begun)
+            rewards[begun] = 0.0
+        ends = self._ends(seen)
+        terminated, truncated = judging.terminated(ends), judging.truncated(ends)
         self._over = terminated | truncated
-        observations, infos = self._observations(), self._infos()
+        infos = self._infos(seen)
         if self._over.any() and self.autoreset_mode is not AutoresetMode.DISABLED:
             self.plant.reset(mask=self._over)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
-                infos = self._final(observations, infos)
-                observations = self._observations()
-                self._over[:] = False
-        return observations, rewards, terminated, truncated, infos
+                seen, infos = self._begin_again(seen, infos)
+        return seen.observations, rewards, terminated, truncated, infos
 
     def _begun(self, mask: np.ndarray | None) -> np.ndarray:
         """The formations of the mask that ended and have been started again for the next step."""
@@ -186,37 +210,42 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             return np.zeros_like(self._over)
         return self._over if mask is None else self._over & mask
 
-    def _final(self, observations: np.ndarray, infos: dict[str, Any]) -> dict[str, Any]:
-        """The infos of the new episodes, with what the ended ones left."""
-        last = np.full(self.num_envs, None, dtype=object)
+    def _begin_again(self, last: Excerpt, infos: dict[str, Any]) -> tuple[Excerpt, dict[str, Any]]:
+        """What there is to tell of the new episodes, with what the ended ones left."""
+        seen = Excerpt(last.robot, last.numbers.copy(), last.observations.copy())
+        self.plant.write_excerpt(seen, self._over)
+        left = np.full(self.num_envs, None, dtype=object)
         for k in np.flatnonzero(self._over):
-            last[k] = observations[k]
-        fresh = self._infos()
-        fresh |= {"final_obs": last, "_final_obs": self._over.copy()}
+            left[k] = last.observations[k]
+        fresh = self._infos(seen)
+        fresh |= {"final_obs": left, "_final_obs": self._over.copy()}
         fresh |= {"final_info": infos, "_final_info": self._over.copy()}
-        return fresh
+        self._over[:] = False
+        return seen, fresh
 
-    def _observations(self) -> np.ndarray:
-        return self.plant.observations[:, self._robot].copy()
+    def _ends(self, seen: Excerpt) -> np.ndarray:
+        return seen.numbers[END, : self.num_envs].astype(np.int8)
 
-    def _infos(self) -> dict[str, Any]:
+    def _infos(self, seen: Excerpt) -> dict[str, Any]:
         """Gymnasium's form: an array over the sub-environments for each key, and a mask ``_key``."""
-        p, r = self.plant, self._robot
+        rows, ends = seen.numbers[:, : self.num_envs], self._ends(seen)
         everywhere = np.ones(self.num_envs, dtype=np.bool_)
 
-        def columns(names: Sequence[str], rows: np.ndarray) -> dict[str, Any]:
-            table = rows.T.copy()
-            named: dict[str, Any] = dict(zip(names, table, strict=True))
-            return named | {f"_{name}": everywhere for name in names}
+        def named(names: Names, values: Iterable[Any]) -> dict[str, Any]:
+            columns = dict(zip(names.keys, values, strict=True))
+            columns.update(dict.fromkeys(names.masks, everywhere))
+            return columns
 
-        infos = columns(Info._fields, p.infos[:, r])
-        infos["reward"] = columns(RewardTerms._fields, p.terms[:, r])
-        infos["disturbance"] = columns(PATHS, p.applied[:, r])
-        infos |= {"lost": p.lost[:, r].copy(), "touched": p.touched[:, r].copy()}
-        infos |= {"end": np.array(END_REASONS)[p.ends[:, r]], "_end": p.ends[:, r] != 0}
-        return infos | {
-            f"_{name}": everywhere for name in ("reward", "disturbance", "lost", "touched")
-        }
+        infos = named(INFO, rows[:TERMS])
+        terms, channels = (
+            named(REWARDS, rows[TERMS:APPLIED]),
+            named(DISTURBANCE, rows[APPLIED:REWARD]),
+        )
+        infos |= named(OTHERS, (terms, channels, rows[LOST] != 0, rows[TOUCHED] != 0))
+        ended = ends != 0
+        reasons = np.zeros(self.num_envs, REASONS.dtype)
+        reasons[ended] = REASONS[ends[ended]]
+        return infos | {"end": reasons, "_end": ended}
 
     def close_extras(self, **kwargs: Any) -> None:
         """Nothing is open."""

@@ -22,6 +22,9 @@ from typing import Any, TypeVar
 
 import numba
 import platformdirs
+from numba.core import types
+from numba.core.cgutils import create_struct_proxy
+from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -116,6 +119,17 @@ def driver(function: F) -> F:
     finally:
         numba.config.CACHE_DIR = before
     return compiled
+
+
+@intrinsic
+def fetch_add(typing: Any, numbers: Any, amount: Any) -> Any:
+    """Add to an array's first whole number and return what it was, as one step for all threads."""
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        array = create_struct_proxy(signature.args[0])(context, builder, value=values[0])
+        return builder.atomic_rmw("add", array.data, values[1], "monotonic")
+
+    return types.int64(numbers, types.int64), build
 
 
 def reader(row: type[Any]) -> Callable[..., Any]:

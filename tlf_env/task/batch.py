@@ -14,6 +14,7 @@ import numpy as np
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.task import drivers, judging
 from tlf_env.task.arrays import Arrays, make_arrays, make_variants
+from tlf_env.task.excerpt import Excerpt, empty_excerpt
 from tlf_env.task.formation import NO_POSES, reference_table, refusal, state_rows
 from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.settings import settings
@@ -22,7 +23,6 @@ from tlf_env.task.starting import STARTED
 Source = str | Path | Mapping[str, Any] | Scenario
 
 MAY_DIFFER = ("name", "robots", "robot", "wheel_loop", "ekf", "ekf_slip", "disturbance")
-LANES_PER_BLOCK = 128  # what a thread takes at a time
 
 
 class BatchPlant:
@@ -75,6 +75,7 @@ class BatchPlant:
         each = [settings(one) for one in self.scenarios]
         self._settings = each[0]._replace(changing=any(one.changing for one in each))
         self._seeded = np.zeros(self.formations, dtype=np.bool_)
+        self._nothing = empty_excerpt(self.arrays, 0, 0)
         self._pool: ThreadPoolExecutor | None = None
 
     @property
@@ -126,6 +127,14 @@ class BatchPlant:
             raise ValueError(f"formation {lane}: {why}")
         drivers.look(a, chosen, True, self._settings)
 
+    def excerpt(self, robot: int) -> Excerpt:
+        """Room for what there is to tell of one robot in each formation, not yet written."""
+        return empty_excerpt(self.arrays, robot, self.formations)
+
+    def write_excerpt(self, out: Excerpt, mask: np.ndarray | None = None) -> None:
+        """Write what there is to tell of the formations of the mask; all if None."""
+        drivers.excerpt_of(self.arrays, self._checked_mask(mask), out)
+
     def reset_finished(self) -> np.ndarray:
         """Start the next episode wherever one ended in the last step; returns their mask."""
         ended = self.ended
@@ -133,7 +142,7 @@ class BatchPlant:
             self.reset(mask=ended)
         return ended
 
-    def step(self, actions: np.ndarray) -> None:
+    def step(self, actions: np.ndarray, excerpt: Excerpt | None = None) -> None:
         """Advance all formations by one control period.
 
         A formation whose episode has ended goes on if it is not reset, up to its horizon.
@@ -142,6 +151,8 @@ class BatchPlant:
         ----------
         actions
             ``(formations, robots, 2)``.
+        excerpt
+            Where to write what there is to tell of one robot in each formation, if anywhere.
 
         Raises
         ------
@@ -163,18 +174,19 @@ class BatchPlant:
             over = np.flatnonzero(~self._seeded | (a.clock[:, 1] >= s.horizon))
             raise RuntimeError(f"formation {over[0]}: call reset() before step()")
         a.actions[:] = given
-        starts = range(0, self.formations, LANES_PER_BLOCK)
-        if self.threads == 1 or len(starts) == 1:
-            drivers.control_step(a, 0, self.formations, s)
-            return
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self.threads)
-        for _ in self._pool.map(self._step_block, starts):
-            pass
+        threads = min(self.threads, -(-self.formations // drivers.LANES_AT_ONCE))
+        left = drivers.lanes_to_step(0, self.formations, threads)
+        work = (a, left, self._nothing if excerpt is None else excerpt, s)
+        helpers = [self._others().submit(drivers.control_step, *work) for _ in range(threads - 1)]
+        drivers.control_step(*work)
+        for helper in helpers:
+            helper.result()
 
-    def _step_block(self, first: int) -> None:
-        last = min(first + LANES_PER_BLOCK, self.formations)
-        drivers.control_step(self.arrays, first, last, self._settings)
+    def _others(self) -> ThreadPoolExecutor:
+        """The other threads, kept from step to step."""
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self.threads - 1)
+        return self._pool
 
     @property
     def observations(self) -> np.ndarray:

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tlf_env.numerics.compiled import block, driver, law
+from tlf_env.numerics.compiled import block, driver, fetch_add, law
 from tlf_env.onboard.observer import Message
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
 from tlf_env.physics.state import read_body
@@ -35,6 +35,7 @@ from tlf_env.task.arrays import (
     Variants,
 )
 from tlf_env.task.channels import STEP_CHANNELS, SUBSTEP_CHANNELS
+from tlf_env.task.excerpt import Excerpt, write_excerpt
 from tlf_env.task.judging import (
     CLIPPED,
     end_lane,
@@ -51,8 +52,8 @@ from tlf_env.task.substeps import delays, evaluate, refresh
 from tlf_env.task.tiles import advance
 
 DONE, MUST_COLLIDE, MUST_SUBSTEP = -1, -2, -3
-FIRST_LANE = np.zeros(1, dtype=np.int64)
 LANES_AT_ONCE = 16  # whose arrays stay in the processor's cache during a step
+SHARES = 4  # of what is left, divided by the threads: how much a thread takes at a time
 
 
 @law
@@ -165,6 +166,14 @@ def look_all(a: Arrays, first: int, last: int, s: Settings) -> None:
 
 
 @driver
+def excerpt_of(a: Arrays, mask: np.ndarray, out: Excerpt) -> None:
+    """Write the excerpt of the lanes of the mask."""
+    for lane in range(mask.shape[0]):
+        if mask[lane]:
+            write_excerpt(a, lane, lane + 1, out)
+
+
+@driver
 def delayed_message_of(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
     """:func:`delayed_message`, for observers outside."""
     return delayed_message(a, lane, r, step, s)
@@ -247,45 +256,63 @@ def mark_all_touched(a: Arrays, lanes: np.ndarray) -> None:
         mark_touched(a, lanes[i])
 
 
+def lanes_to_step(first: int, last: int, threads: int = 1) -> np.ndarray:
+    """The lanes from ``first`` to before ``last``, for as many calls of :func:`control_step` at once."""
+    return np.array([first, last, threads])
+
+
+@law
+def take_lanes(left: np.ndarray) -> tuple[int, int]:
+    """Some lanes that no other thread takes: many at first, few in the end, so that all end together."""
+    share = (left[1] - left[0]) // (SHARES * left[2])
+    count = LANES_AT_ONCE * max(1, share // LANES_AT_ONCE)
+    begin = fetch_add(left, count)
+    return begin, min(begin + count, left[1])
+
+
 @driver
-def control_step(a: Arrays, first: int, last: int, s: Settings) -> int:
-    """A whole control step of the lanes from ``first`` to before ``last``.
+def control_step(a: Arrays, left: np.ndarray, out: Excerpt, s: Settings) -> int:
+    """A whole control step of lanes (see :func:`lanes_to_step`) until none is left, and their excerpt.
 
     Returns ``DONE``; or the number of the first robot whose action is not finite (see
-    :func:`first_bad_action`), and nothing has changed. For a single lane also ``MUST_COLLIDE`` or
+    :func:`first_bad_action`), and nothing has changed for it. For a single lane also ``MUST_COLLIDE`` or
     ``MUST_SUBSTEP``: actions are taken, and the substeps are left to the plant's space, because robots
     are close, or to Python, because there are parts that live there.
     """
-    bad = first_bad_action(a, first, last)
-    if bad != DONE:
-        return bad
     apart_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
     close_lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
     near = np.empty(LANES_AT_ONCE, dtype=np.bool_)
-    for begin in range(first, last, LANES_AT_ONCE):
-        end = min(begin + LANES_AT_ONCE, last)
-        take_all_actions(a, begin, end, s)
-        find_near(a, begin, end, near, s)
-        apart = close = 0
-        for lane in range(begin, end):
-            if near[lane - begin] and s.collides:
-                return MUST_COLLIDE
-            if s.has_parts:
-                return MUST_SUBSTEP
-            if near[lane - begin]:
-                close_lanes[close], close = lane, close + 1
-            else:
-                apart_lanes[apart], apart = lane, apart + 1
-        lanes = apart_lanes[:apart]
-        advance(a, lanes, 0, s.substeps, True, True, s)
-        if s.kinematic:
-            mark_all_touched(a, lanes)
-        # Robots pass through each other here. While they are close, each substep asks which outlines
-        # meet, so that the first touch is marked where a plant with contact marks it.
-        lanes = close_lanes[:close]
-        for k in range(s.substeps if close > 0 else 0):
-            advance(a, lanes, k, k + 1, True, True, s)
-            mark_all_touched(a, lanes)
-        transmit_all(a, begin, end, s)
-        look_all(a, begin, end, s)
+    first, last = take_lanes(left)
+    while first < last:
+        bad = first_bad_action(a, first, last)
+        if bad != DONE:
+            return bad
+        for begin in range(first, last, LANES_AT_ONCE):
+            end = min(begin + LANES_AT_ONCE, last)
+            take_all_actions(a, begin, end, s)
+            find_near(a, begin, end, near, s)
+            apart = close = 0
+            for lane in range(begin, end):
+                if near[lane - begin] and s.collides:
+                    return MUST_COLLIDE
+                if s.has_parts:
+                    return MUST_SUBSTEP
+                if near[lane - begin]:
+                    close_lanes[close], close = lane, close + 1
+                else:
+                    apart_lanes[apart], apart = lane, apart + 1
+            lanes = apart_lanes[:apart]
+            advance(a, lanes, 0, s.substeps, True, True, s)
+            if s.kinematic:
+                mark_all_touched(a, lanes)
+            # Robots pass through each other here. While they are close, each substep asks which
+            # outlines meet, so that the first touch is marked where a plant with contact marks it.
+            lanes = close_lanes[:close]
+            for k in range(s.substeps if close > 0 else 0):
+                advance(a, lanes, k, k + 1, True, True, s)
+                mark_all_touched(a, lanes)
+            transmit_all(a, begin, end, s)
+            look_all(a, begin, end, s)
+            write_excerpt(a, begin, end, out)
+        first, last = take_lanes(left)
     return DONE

@@ -21,6 +21,7 @@ from tlf_env.task.channels import (
     START_POSITION,
     STEP_CHANNELS,
 )
+from tlf_env.task.excerpt import empty_excerpt
 from tlf_env.task.judging import BODY_D
 from tlf_env.task.parts import Parts, part_factories
 from tlf_env.task.scenario import Scenario
@@ -61,6 +62,8 @@ class Formation:
         self.plant = PymunkPlant(list(scenario.robot_models))
         self._parts = Parts(part_factories(scenario, parts or {}), scenario)
         self._settings = settings(scenario)
+        self._left = drivers.lanes_to_step(0, 1)
+        self._nothing = empty_excerpt(self.arrays, 0, 0)
 
     @property
     def time_s(self) -> float:
@@ -149,7 +152,8 @@ class Formation:
             for an action that is not finite, naming the robot; then nothing has changed.
         """
         a, s = self.arrays, self._settings
-        result = drivers.control_step(a, 0, 1, s)
+        self._left[0] = 0
+        result = drivers.control_step(a, self._left, self._nothing, s)
         if result == drivers.DONE:
             return
         if result >= 0:
