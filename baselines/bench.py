@@ -13,15 +13,13 @@ import inspect
 import json
 import os
 import subprocess
-import threading
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from importlib.util import find_spec
-from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from baselines.jobs import claim, spread
 from baselines.learned import LearnedPolicy
 from baselines.policies import enter
 from baselines.run import Record, run_policy, run_seeds, versions
@@ -32,7 +30,7 @@ from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario, preset_names, presets_folder
 
 RUNS, PLAN = "runs.jsonl", "plan.json"
-FIRST_TABLE_SEED = 20_000
+FIRST_CHOOSING_SEED, FIRST_TABLE_SEED = 10_000, 20_000
 IN_FLIGHT_PER_PROCESS = 4
 SEEDS_PER_BLOCK = 25  # a record takes 2 to 4 MB
 
@@ -300,18 +298,7 @@ class Results:
         self.folder, self.plan = folder, plan
         record = plan_record(plan)
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / PLAN
-        if path.exists():
-            before = json.loads(path.read_text(encoding="utf-8"))
-            for key in ("plan", "policies", "scenarios", "sources"):
-                if before.get(key) != record[key]:
-                    raise ValueError(
-                        f"{folder} holds results of another {key}; take another --out, or remove it"
-                    )
-        else:
-            with atomic(path, encoding="utf-8") as file:
-                json.dump(record, file, indent=2)
-                file.write("\n")
+        claim(folder / PLAN, record, ("plan", "policies", "scenarios", "sources"), "results")
         self.lines = self._read()
 
     def _read(self) -> dict[Cell, dict[str, Any]]:
@@ -377,91 +364,17 @@ def run_bench(
     total = len(plan.cells())
     if progress is not None:
         progress(total - len(todo), total)
-    finished: Iterable[list[dict[str, Any]]]
-    if ray_address is not None:
-        finished = _on_ray(plan, blocks(plan, todo), ray_address)
-    elif processes == 1:
-        finished = (run_block(plan, block) for block in blocks(plan, todo))
-    else:
-        finished = _in_processes(plan, blocks(plan, todo), processes)
+    finished = spread(
+        run_block,
+        plan,
+        blocks(plan, todo),
+        processes=processes,
+        ray_address=ray_address,
+        ahead=IN_FLIGHT_PER_PROCESS,
+    )
     for lines in finished:
         for line in lines:
             results.add(line)
         if progress is not None:
             progress(len(results.lines), total)
     return results
-
-
-def _in_processes(
-    plan: Plan, work: list[tuple[Cell, ...]], processes: int
-) -> Iterator[list[dict[str, Any]]]:
-    """Results as they come; only a few blocks are handed out ahead, so that an interrupt is quick."""
-    waiting = iter(work)
-    pool = ProcessPoolExecutor(
-        processes, mp_context=get_context("spawn"), initializer=_end_with_parent
-    )
-    running: set[Future[list[dict[str, Any]]]] = set()
-    try:
-        while True:
-            while len(running) < processes * IN_FLIGHT_PER_PROCESS:
-                block = next(waiting, None)
-                if block is None:
-                    break
-                running.add(pool.submit(run_block, plan, block))
-            if not running:
-                return
-            done, running = wait(running, return_when=FIRST_COMPLETED)
-            for future in done:
-                yield future.result()
-    finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """Let this worker end when its parent is killed, which a pool by itself does not."""
-    parent = parent_process()
-
-    def wait_and_leave() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait_and_leave, daemon=True).start()
-
-
-def _on_ray(
-    plan: Plan, work: list[tuple[Cell, ...]], address: str
-) -> Iterator[list[dict[str, Any]]]:
-    """Results as they come from an existing Ray cluster.
-
-    Raises
-    ------
-    ValueError
-        if ray is not installed or the cluster cannot be reached.
-    """
-    try:
-        import ray
-    except ModuleNotFoundError as error:
-        raise ValueError("--ray needs ray (pip install 'tlf-env[ray]')") from error
-    try:
-        ray.init(address=address, log_to_driver=False)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise ValueError(f"no Ray cluster at {address!r}: {error}") from error
-    try:
-        remote = ray.remote(num_cpus=1)(run_block)
-        shared = ray.put(plan)
-        limit = IN_FLIGHT_PER_PROCESS * max(1, int(ray.cluster_resources().get("CPU", 1)))
-        waiting = iter(work)
-        running: list[Any] = []
-        while True:
-            while len(running) < limit:
-                block = next(waiting, None)
-                if block is None:
-                    break
-                running.append(remote.remote(shared, block))
-            if not running:
-                return
-            done, running = ray.wait(running)
-            yield from ray.get(done)
-    finally:
-        ray.shutdown()
