@@ -22,6 +22,7 @@ from typing import Any, NamedTuple
 from baselines.jobs import claim, spread
 from baselines.learned import LearnedPolicy
 from baselines.policies import enter
+from baselines.reference import ReferencePolicy
 from baselines.run import Record, run_policy, run_seeds, versions
 from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.files import atomic
@@ -240,14 +241,15 @@ def policy_hash(name: str, policy: Policy) -> str | None:
 
 
 def _sources(policy: Policy) -> list[Path]:
-    """A learned policy's weights and card, or the file that defines the object's class."""
+    """A learned policy's weights and card, or the file of the object's class and what it was made from."""
     if isinstance(policy, LearnedPolicy):
         return list(policy.files)
     try:
         source = inspect.getsourcefile(type(policy))
     except TypeError:
         return []
-    return [Path(source)] if source else []
+    made_from = policy.files if isinstance(policy, ReferencePolicy) else ()
+    return [Path(source), *made_from] if source else []
 
 
 def plan_record(plan: Plan) -> dict[str, Any]:
