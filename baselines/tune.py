@@ -288,8 +288,8 @@ def _rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
-def load_tune(source: str | Path) -> TuneConfig:
-    """A search from a preset's name (``tuned``) or a YAML file.
+def load_tune(source: str | Path, *, trials: int | None = None) -> TuneConfig:
+    """A search from a preset's name (``tuned``) or a YAML file; ``trials`` in all, if it is given.
 
     Raises
     ------
@@ -304,7 +304,8 @@ def load_tune(source: str | Path) -> TuneConfig:
     if path.suffix not in (".yaml", ".yml"):
         raise ValueError(f"search {str(source)!r} is neither {', '.join(names)} nor a .yaml file")
     try:
-        return TuneConfig.model_validate(read_yaml(path))
+        given = {} if trials is None else {"trials": trials}
+        return TuneConfig.model_validate(read_yaml(path) | given)
     except ValidationError as error:
         raise ValueError(one_line(error)) from error
 

@@ -365,6 +365,7 @@ def test_bad_input_is_one_line_and_writes_nothing(change, said, tmp_path, monkey
         ("no_such", "'no_such' is neither tuned nor a .yaml file"),
         ("no_such.yaml", "cannot read no_such.yaml"),
         ("list.yaml", "must hold a mapping"),
+        ("search.yaml --trials 0", "trials: Input should be greater than or equal to 1, got 0"),
         ("search.yaml --workers -1", "workers -1 must be at least 1"),
     ],
 )
@@ -391,15 +392,16 @@ def test_the_command_prints_its_result(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "search.yaml").write_text(yaml.safe_dump(SMALL))
     printed = []
-    for words in (["--json"], []):
+    for words in (["--json", "--trials", "3"], []):
         monkeypatch.setattr(sys, "argv", ["tlf", "tune", "search.yaml", *words])
         main()
         printed.append(capsys.readouterr().out)
     result = json.loads(printed[0])
     folder = tmp_path / "results" / "tune" / "search"
-    assert yaml.safe_load((folder / tune.RESULT).read_text())["controller"] == result["controller"]
-    assert result["found"]["command"] == "tlf tune search.yaml --json"
-    assert f"trial {result['found']['trial']}" in printed[1]
+    assert yaml.safe_load((folder / tune.RESULT).read_text())["found"]["search"]["trials"] == 9
+    assert result["found"]["command"] == "tlf tune search.yaml --json --trials 3"
+    assert result["found"]["search"]["trials"] == 3
+    assert "less is better" in printed[1]
     assert "--gains results/tune/search/tuned.yaml" in " ".join(printed[1].split())
 
 

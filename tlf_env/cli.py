@@ -385,6 +385,9 @@ def bench(
 @app.command()
 def tune(
     config: Annotated[str, typer.Argument(help="A search: a preset (tuned), or a YAML file.")],
+    trials: Annotated[
+        int | None, typer.Option(help="Trials in all, those of earlier calls included.")
+    ] = None,
     workers: Annotated[
         int, typer.Option(help="Processes on this machine; 0: one per core. One repeats exactly.")
     ] = 1,
@@ -401,7 +404,7 @@ def tune(
     """Find a controller's gains, limits and filter; interrupt it and call it again to go on."""
     from baselines.tune import RESULT, load_tune, run_tune
 
-    search = load_tune(config)
+    search = load_tune(config, trials=trials)
     folder = out or Path("results") / "tune" / Path(config).stem
     warn_of_compiling()
     with progress_bar("tune") as update:
