@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import fcntl
 import json
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from contextlib import contextmanager
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, TypeVar
@@ -49,6 +51,26 @@ def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) ->
             raise ValueError(
                 f"{path.parent} holds {what} of another {key}; take another --out, or remove it"
             )
+
+
+@contextmanager
+def alone_in(folder: Path) -> Iterator[None]:
+    """Keep other processes that ask for it out of a folder; a process that is killed keeps nobody out.
+
+    Raises
+    ------
+    ValueError
+        if one is there.
+    """
+    handle = os.open(folder, os.O_RDONLY)
+    try:
+        try:
+            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError as error:
+            raise ValueError(f"another process is at work in {folder}") from error
+        yield
+    finally:
+        os.close(handle)
 
 
 def spread(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import accumulate
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple, Self
@@ -31,10 +31,11 @@ from baselines.bench import (
     FIRST_TABLE_SEED,
     SEEDS_PER_BLOCK,
     git_revision,
+    scenario_hash,
     with_value,
 )
 from baselines.controllers import ControllerFile
-from baselines.jobs import claim, spread
+from baselines.jobs import alone_in, claim, spread
 from baselines.reference import ReferencePolicy
 from baselines.run import Record, run_seeds, versions
 from tlf_env.numerics.compiled import sources_digest
@@ -401,7 +402,11 @@ class Study:
 
         asked = config.model_dump(mode="json")
         del asked["trials"]  # more of them go on where the search ended
-        record = {**asked, "simulation": sources_digest()}
+        scenarios = {
+            place: scenario_hash(scenario)
+            for place, scenario in config.scenarios(config.ekf_slip).items()
+        }
+        record = {**asked, "scenarios": scenarios, "simulation": sources_digest()}
         folder.mkdir(parents=True, exist_ok=True)
         keys = tuple(record)
         record |= {"versions": versions(), "git_revision": git_revision()}
@@ -559,35 +564,42 @@ def run_tune(
     Raises
     ------
     ValueError
-        for a folder that holds another search, a missing package, or no worker, before anything is run.
+        for a folder that holds another search or in which another process is at work, a missing package,
+        or no worker, before anything is run.
     """
     if workers < 1:
         raise ValueError(f"workers {workers} must be at least 1")
     study = Study(config, folder)
-    told = len(study.trials("COMPLETE", "PRUNED"))
-    total = max(config.trials, told)
+    with alone_in(folder):
+        chosen = _search(study, workers, ray_address, progress or (lambda done, total: None))
+        result = _result(study, chosen, command)
+        _write(result, folder / RESULT)
+    return result
 
-    def shown(more: int, last: int) -> None:
-        if progress is not None:
-            progress(more, last)
 
-    def driven(jobs: Iterator[Job] | list[Job]) -> Iterator[Outcome]:
+def _search(
+    study: Study, workers: int, ray_address: str | None, progress: Callable[[int, int], None]
+) -> dict[int, Outcome]:
+    """Drive what is left of the search, then the finalists on the seeds for choosing; their outcomes."""
+    config = study.config
+
+    def driven(jobs: Iterable[Job]) -> Iterator[Outcome]:
         return spread(evaluate, config, jobs, processes=workers, ray_address=ray_address)
 
-    shown(told, total + config.choose.finalists)
+    done = len(study.trials("COMPLETE", "PRUNED"))
+    total = max(config.trials, done) + config.choose.finalists
+    progress(done, total)
     for outcome in driven(study.jobs()):
         study.tell(outcome)
-        told += 1
-        shown(told, total + config.choose.finalists)
+        done += 1
+        progress(done, total)
     finalists, chosen = study.finalists(), study.chosen()
-    left = [n for n in finalists if n not in chosen]
-    for outcome in driven([Job(n, study.values(n), config.choose.all, {}) for n in left]):
+    left = [number for number in finalists if number not in chosen]
+    for outcome in driven(Job(n, study.values(n), config.choose.all, {}) for n in left):
         study.choose(outcome)
         chosen[outcome.number] = outcome
-        shown(told + len(chosen), told + len(finalists))
-    result = _result(study, chosen, command)
-    _write(result, folder / RESULT)
-    return result
+        progress(done + len(chosen), done + len(finalists))
+    return chosen
 
 
 def _result(study: Study, chosen: dict[int, Outcome], command: str) -> dict[str, Any]:

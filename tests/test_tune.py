@@ -29,7 +29,7 @@ from baselines.tune import (
 )
 from tlf_env.cli import main
 from tlf_env.onboard.tracking import CONTROLLERS, controller
-from tlf_env.task.scenario import load_scenario
+from tlf_env.task.scenario import load_scenario, presets_folder
 
 SMALL = {
     "start": "tuned",
@@ -169,6 +169,26 @@ def test_another_search_in_the_same_folder_is_refused(tmp_path, monkeypatch, cha
         run_tune(config(**change), tmp_path)
 
 
+def test_a_task_whose_file_changed_is_refused(tmp_path):
+    path = tmp_path / "round.yaml"
+    text = "trajectory: {{type: circle, radius_mm: 800, speed_mm_s: {}}}\n"
+    path.write_text(text.format(200))
+    Study(config(tasks=[str(path)]), tmp_path / "out")
+    path.write_text(text.format(300))
+    with pytest.raises(ValueError, match="holds a search of another scenarios"):
+        Study(config(tasks=[str(path)]), tmp_path / "out")
+
+
+def test_two_at_once_in_a_folder_are_refused(tmp_path, monkeypatch):
+    def drive(settings, job):
+        with pytest.raises(ValueError, match="another process is at work in"):
+            run_tune(config(), tmp_path)
+        return quick(settings, job)
+
+    monkeypatch.setattr(tune, "evaluate", drive)
+    assert run_tune(config(trials=1), tmp_path) == run_tune(config(trials=1), tmp_path)
+
+
 def test_a_database_that_is_none_is_told(tmp_path):
     (tmp_path / tune.STUDY).write_bytes(b"no database, " * 100)
     with pytest.raises(ValueError, match=r"study\.db cannot be read"):
@@ -215,7 +235,7 @@ def test_a_failed_run_costs_more_than_any_other():
         assert objective.cost({**best, name: 1.0}, False) > objective.cost(best, False)
 
 
-def test_the_result_is_a_controller_that_scores_the_same(tmp_path, monkeypatch):
+def test_the_result_is_a_controller_that_scores_the_same(tmp_path):
     settings = config(trials=3, startup_trials=1)
     result = run_tune(settings, tmp_path, command="tlf tune x.yaml")
     found, path = result["found"], str(tmp_path / tune.RESULT)
@@ -412,6 +432,15 @@ def test_the_start_is_the_first_trial(tmp_path):
     file = settings.built(job.values)
     assert (job.number, file.controller) == (0, controller("tuned"))
     assert file.ekf_slip == settings.ekf_slip
+
+
+def test_the_committed_result_is_of_the_committed_search():
+    folder = presets_folder() / "tune"
+    result = load_controller(folder / "tuned-result.yaml")
+    search = load_tune("tuned").model_dump(mode="json")
+    assert set(result.found["search"]["search"]) == set(search["search"])
+    assert result.found["search"]["seeds"] == search["seeds"]
+    assert result.found["choose"]["found"]["score"] <= result.found["choose"]["start"]["score"]
 
 
 def test_a_search_may_say_its_start_in_numbers():
