@@ -45,8 +45,8 @@ SMALL = {
     "seeds": {"first": 0, "count": 2},
     "choose": {"first": 10_000, "count": 2, "finalists": 2},
     "horizon_s": 2,
-    "trials": 9,
-    "startup_trials": 4,
+    "trials": 7,
+    "startup_trials": 3,
     "objective": {"settled_formation_rmse_mm": 0},
 }
 COMMAND = [sys.executable, "-c", "from tlf_env.cli import main; main()", "tune"]
@@ -79,62 +79,64 @@ def trials(folder, settings):
     ]
 
 
-def interrupted_at(*numbers, times=1):
-    """The quick drive, cut short at some trials so many times each."""
-    left = dict.fromkeys(numbers, times)
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Folder and result of a search that nobody interrupted."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tune, "evaluate", quick)
+        return folder, run_tune(config(), folder)
+
+
+def test_a_search_that_is_interrupted_is_the_search_that_was_not(tmp_path, monkeypatch, whole):
+    left = [0, 5, 5]
 
     def drive(settings, job):
-        if job.seeds[0] < 10_000 and left.get(job.number, 0):
-            left[job.number] -= 1
+        if left and (job.number, job.seeds) == (left[0], [0, 1]):
+            left.pop(0)
             raise KeyboardInterrupt
         return quick(settings, job)
 
-    return drive
-
-
-def test_a_search_that_is_interrupted_is_the_search_that_was_not(tmp_path, monkeypatch):
-    monkeypatch.setattr(tune, "evaluate", quick)
-    whole = run_tune(config(), tmp_path / "whole")
-    monkeypatch.setattr(tune, "evaluate", interrupted_at(0, 2, 7, times=2))
-    for finished in (0, 0, 2, 2, 7, 7):
+    monkeypatch.setattr(tune, "evaluate", drive)
+    while left:
+        finished = left[0]
         with pytest.raises(KeyboardInterrupt):
-            run_tune(config(), tmp_path / "cut")
-        states = [state for _, state, *_ in trials(tmp_path / "cut", config())]
+            run_tune(config(), tmp_path)
+        states = [state for _, state, *_ in trials(tmp_path, config())]
         assert len([s for s in states if s in ("COMPLETE", "PRUNED")]) == finished
-    result = run_tune(config(), tmp_path / "cut")
-    assert result == whole
-    assert trials(tmp_path / "cut", config()) == trials(tmp_path / "whole", config())
-    assert (tmp_path / "cut" / tune.RESULT).read_text() == (
-        tmp_path / "whole" / tune.RESULT
-    ).read_text()
+    assert run_tune(config(), tmp_path) == whole[1]
+    assert trials(tmp_path, config()) == trials(whole[0], config())
+    written = [(folder / tune.RESULT).read_text() for folder in (tmp_path, whole[0])]
+    assert written[0] == written[1]
 
 
 @pytest.mark.parametrize("write", ["set_trial_user_attr", "set_trial_state_values"])
-def test_a_trial_that_was_driven_and_not_stored_whole_is_driven_again(tmp_path, monkeypatch, write):
+def test_a_trial_that_was_driven_and_not_stored_whole_is_driven_again(
+    tmp_path, monkeypatch, whole, write
+):
     """The process may end between any two writes to the database."""
     monkeypatch.setattr(tune, "evaluate", quick)
-    run_tune(config(), tmp_path / "whole")
-    study = Study(config(), tmp_path / "cut")
+    study = Study(config(), tmp_path)
 
     real = getattr(study._study._storage, write)
 
     def stops(*words, **named):
-        if len(study.trials("COMPLETE", "PRUNED")) == 6:
+        if len(study.trials("COMPLETE", "PRUNED")) == 4:
             raise KeyboardInterrupt
         return real(*words, **named)
 
     monkeypatch.setattr(study._study._storage, write, stops)
     jobs = study.jobs()
-    for _ in range(6):
+    for _ in range(4):
         study.tell(quick(config(), next(jobs)))
     last = quick(config(), next(jobs))
     with pytest.raises(KeyboardInterrupt):
         study.tell(last)
-    run_tune(config(), tmp_path / "cut")
-    assert trials(tmp_path / "cut", config()) == trials(tmp_path / "whole", config())
+    run_tune(config(), tmp_path)
+    assert trials(tmp_path, config()) == trials(whole[0], config())
 
 
-def test_what_is_finished_is_not_driven_again_and_more_trials_go_on(tmp_path, monkeypatch):
+def test_what_is_finished_is_not_driven_again_and_more_trials_go_on(tmp_path, monkeypatch, whole):
     driven = []
 
     def drive(settings, job):
@@ -142,15 +144,14 @@ def test_what_is_finished_is_not_driven_again_and_more_trials_go_on(tmp_path, mo
         return quick(settings, job)
 
     monkeypatch.setattr(tune, "evaluate", drive)
-    run_tune(config(trials=6), tmp_path / "grown")
+    run_tune(config(trials=4), tmp_path)
     before = len(driven)
-    run_tune(config(trials=6), tmp_path / "grown")
+    run_tune(config(trials=4), tmp_path)
     assert len(driven) == before
-    run_tune(config(), tmp_path / "grown")
-    assert [n for n, seed in driven if seed == 0] == list(range(9))
+    run_tune(config(), tmp_path)
+    assert [n for n, seed in driven if seed == 0] == list(range(7))
     assert len(set(driven)) == len(driven)
-    run_tune(config(), tmp_path / "whole")
-    assert trials(tmp_path / "grown", config()) == trials(tmp_path / "whole", config())
+    assert trials(tmp_path, config()) == trials(whole[0], config())
 
 
 @pytest.mark.parametrize(
@@ -218,8 +219,8 @@ def test_the_seeds_for_choosing_choose(tmp_path, monkeypatch):
 
 def test_a_trial_that_fails_more_than_the_start_is_stopped(tmp_path, monkeypatch):
     monkeypatch.setattr(tune, "evaluate", quick)
-    run_tune(config(trials=16), tmp_path)
-    for _, state, values, _, attributes in trials(tmp_path, config(trials=16)):
+    run_tune(config(trials=12), tmp_path)
+    for _, state, values, _, attributes in trials(tmp_path, config(trials=12)):
         fails = values["gains.k_1_per_s"] > 1.5
         assert state == ("PRUNED" if fails else "COMPLETE")
         assert len(attributes[tune.SCORES]["strata"]) == (1 if fails else 2)
@@ -418,7 +419,7 @@ def test_the_command_prints_its_result(tmp_path, monkeypatch, capsys):
         printed.append(capsys.readouterr().out)
     result = json.loads(printed[0])
     folder = tmp_path / "results" / "tune" / "search"
-    assert yaml.safe_load((folder / tune.RESULT).read_text())["found"]["search"]["trials"] == 9
+    assert yaml.safe_load((folder / tune.RESULT).read_text())["found"]["search"]["trials"] == 7
     assert result["found"]["command"] == "tlf tune search.yaml --json --trials 3"
     assert result["found"]["search"]["trials"] == 3
     assert "less is better" in printed[1]
