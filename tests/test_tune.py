@@ -426,6 +426,18 @@ def test_the_command_prints_its_result(tmp_path, monkeypatch, capsys):
     assert "--gains results/tune/search/tuned.yaml" in " ".join(printed[1].split())
 
 
+def test_an_interrupt_is_told_and_no_success(tmp_path, monkeypatch, capsys):
+    def drive(settings, job):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tune, "evaluate", drive)
+    monkeypatch.setattr(sys, "argv", ["tlf", "tune", "tuned", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "tlf: interrupted\n"
+
+
 def test_the_start_is_the_first_trial(tmp_path):
     """Whatever the search finds is at least as good on the seeds for choosing."""
     settings = load_tune("tuned")

@@ -521,7 +521,7 @@ def writable_folder(folder: Path) -> Path:
 def main() -> None:
     """Run the command line; every bad input ends in one line on stderr and exit status 2."""
     try:
-        app(sys.argv[1:] or ["--help"], standalone_mode=False)
+        status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
     except TyperException as error:
         fail(error.format_message(), error.exit_code)
     except ValueError as error:
@@ -530,6 +530,9 @@ def main() -> None:
         fail(str(error), FAILED)
     except (KeyboardInterrupt, typer.Abort):
         fail("interrupted", INTERRUPTED)
+    else:
+        if status == INTERRUPTED:  # how typer tells of Ctrl-C
+            fail("interrupted", INTERRUPTED)
 
 
 def fail(message: str, status: int) -> None:
