@@ -55,7 +55,7 @@ constraints: ## Write constraints.txt anew, from a throw-away environment with e
 	$(PYTHON) -m venv "$$tmp/venv"; \
 	py="$$tmp/venv/bin/python"; \
 	"$$py" -m pip install -q --disable-pip-version-check "torch==$(TORCH)" \
-		build editables hatchling ".[figures,view,train,bench,peers,ray,dev]"; \
+		build editables hatchling ".[figures,view,train,tune,bench,peers,ray,dev]"; \
 	"$$py" -m pip check; \
 	echo "# Versions of everything that the extras install. Made by: make constraints" > "$$tmp/new"; \
 	"$$py" -m pip freeze --all --exclude pip --exclude tlf-env > "$$tmp/frozen"; \
@@ -77,7 +77,7 @@ $(VENV)/.stamp-run: $(VENV)/.stamp-venv pyproject.toml constraints.txt
 
 # mpe2 is named alone: the extra `peers` would bring vmas, and vmas brings torch.
 $(VENV)/.stamp-test: $(VENV)/.stamp-run
-	$(PIP) -c constraints.txt -e ".[figures,view,bench,dev]" mpe2
+	$(PIP) -c constraints.txt -e ".[figures,view,bench,tune,dev]" mpe2
 	@touch $@
 
 $(VENV)/.stamp-train: $(VENV)/.stamp-test

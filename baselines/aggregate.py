@@ -18,7 +18,7 @@ from arch.bootstrap import IIDBootstrap, IndependentSamplesBootstrap
 from scipy.stats import binomtest, trim_mean
 
 from baselines.bench import Results
-from baselines.policies import policy_names
+from baselines.policies import overrides_told, policy_names
 from tlf_env.numerics.files import atomic
 from tlf_env.task.channels import CHANNELS
 
@@ -538,10 +538,7 @@ def task_tables(board: dict[str, Any], task: str) -> list[str]:
 
 def title(row: dict[str, Any]) -> str:
     """A policy's name, with what it has otherwise than the scenario, and marked if given the truth."""
-    marks = [
-        f"{field} {', '.join(map(str, value)) if isinstance(value, list) else value}"
-        for field, value in row.get("overrides", {}).items()
-    ]
+    marks = overrides_told(row.get("overrides", {}))
     marks += ["privileged"] if row["privileged"] else []
     return row["policy"] + (f" ({'; '.join(marks)})" if marks else "")
 

@@ -19,9 +19,10 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from baselines.jobs import claim, spread
 from baselines.learned import LearnedPolicy
 from baselines.policies import enter
-from baselines.pool import run_jobs
+from baselines.reference import ReferencePolicy
 from baselines.run import Record, run_policy, run_seeds, versions
 from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.files import atomic
@@ -36,7 +37,8 @@ from tlf_env.task.scenario import (
 )
 
 RUNS, PLAN = "runs.jsonl", "plan.json"
-FIRST_TABLE_SEED = 20_000
+FIRST_CHOOSING_SEED, FIRST_TABLE_SEED = 10_000, 20_000
+IN_FLIGHT_PER_PROCESS = 4
 SEEDS_PER_BLOCK = 25  # a record takes 2 to 4 MB
 
 
@@ -278,14 +280,15 @@ def policy_hash(name: str, policy: Policy) -> str | None:
 
 
 def _sources(policy: Policy) -> list[Path]:
-    """A learned policy's weights and card, or the file that defines the object's class."""
+    """A learned policy's weights and card, or the file of the object's class and what it was made from."""
     if isinstance(policy, LearnedPolicy):
         return list(policy.files)
     try:
         source = inspect.getsourcefile(type(policy))
     except TypeError:
         return []
-    return [Path(source)] if source else []
+    made_from = policy.files if isinstance(policy, ReferencePolicy) else ()
+    return [Path(source), *made_from] if source else []
 
 
 def plan_record(plan: Plan) -> dict[str, Any]:
@@ -336,18 +339,7 @@ class Results:
         self.folder, self.plan = folder, plan
         record = plan_record(plan)
         folder.mkdir(parents=True, exist_ok=True)
-        path = folder / PLAN
-        if path.exists():
-            before = json.loads(path.read_text(encoding="utf-8"))
-            for key in ("plan", "policies", "scenarios", "sources"):
-                if before.get(key) != record[key]:
-                    raise ValueError(
-                        f"{folder} holds results of another {key}; take another --out, or remove it"
-                    )
-        else:
-            with atomic(path, encoding="utf-8") as file:
-                json.dump(record, file, indent=2)
-                file.write("\n")
+        claim(folder / PLAN, record, ("plan", "policies", "scenarios", "sources"), "results")
         self.lines = self._read()
 
     def _read(self) -> dict[Cell, dict[str, Any]]:
@@ -413,11 +405,13 @@ def run_bench(
     total = len(plan.cells())
     if progress is not None:
         progress(total - len(todo), total)
-    finished = run_jobs(
+    finished = spread(
         run_block,
-        ((plan, block) for block in blocks(plan, todo)),
+        plan,
+        blocks(plan, todo),
         processes=processes,
         ray_address=ray_address,
+        ahead=IN_FLIGHT_PER_PROCESS,
     )
     for lines in finished:
         for line in lines:

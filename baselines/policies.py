@@ -6,6 +6,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from pydantic import BaseModel
+
 from baselines.card import WEIGHTS
 from baselines.classical import FeedbackLinearisation, PurePursuit
 from baselines.learned import LearnedPolicy, load_policy, shipped_policies
@@ -28,6 +30,7 @@ OVERRIDABLE = (
     "residual_fade_mm",
     "residual_reach_mm",
     "estimator",
+    "ekf_slip",
     "preview_s",
 )
 
@@ -37,7 +40,7 @@ class Entry(NamedTuple):
 
     policy: Policy
     scenario: Scenario
-    overrides: dict[str, Any]  # fields that differ from the scenario given; a list for a tuple
+    overrides: dict[str, Any]  # fields that differ from the scenario given, as JSON has them
 
 
 def policy_names() -> list[str]:
@@ -51,9 +54,10 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     Parameters
     ----------
     name
-        ``reference`` or ``reference:GAINS``, ``pure_pursuit``, ``feedback_linearisation``, the name
-        of a shipped learned policy, the path of a ``.safetensors`` with its card beside it,
-        ``module:factory`` of an object with SB3's ``predict``, or the path of an SB3 ``.zip``.
+        ``reference`` or ``reference:GAINS``, where GAINS is a preset or the path of a controller file
+        (``.yaml``), ``pure_pursuit``, ``feedback_linearisation``, the name of a shipped learned policy,
+        the path of a ``.safetensors`` with its card beside it, ``module:factory`` of an object with
+        SB3's ``predict``, or the path of an SB3 ``.zip``.
     trust
         Allow an SB3 ``.zip``: loading one runs code that is in it.
 
@@ -98,14 +102,31 @@ def enter(name: str, scenario: Scenario, *, trust: bool = False) -> Entry:
             for field in asked
             if getattr(fitted, field) != getattr(scenario, field)
         }
-        asked = {
-            field: list(value) if isinstance(value, tuple) else value
-            for field, value in differing.items()
-        }
+        asked = {field: _plain(value) for field, value in differing.items()}
         scenario = fitted if asked else scenario
     if isinstance(policy, LearnedPolicy):
         policy.check_fit(name, scenario)
     return Entry(policy, scenario, asked)
+
+
+def _plain(value: Any) -> Any:
+    """A scenario's field as JSON has it."""
+    if isinstance(value, BaseModel):
+        return value.model_dump()
+    return list(value) if isinstance(value, tuple) else value
+
+
+def overrides_told(overrides: Mapping[str, Any]) -> list[str]:
+    """What a policy asks of the scenario, for people: a field and its value each."""
+    told = []
+    for field, value in overrides.items():
+        if isinstance(value, Mapping):
+            told.append(f"{field} of its own")
+        elif isinstance(value, list):
+            told.append(f"{field} {', '.join(map(str, value))}")
+        else:
+            told.append(f"{field} {value}")
+    return told
 
 
 def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:

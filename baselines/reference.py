@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from baselines.controllers import SUFFIXES, load_controller
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.tracking import (
     Controller,
@@ -33,7 +35,8 @@ class ReferencePolicy:
     ----------
     gains
         ``"consistent"`` (k₂ = 0.83·k₃), ``"printed"`` (k₂ = 0.83 mm²/s), ``"tuned"`` (other gains,
-        and limits on the twist), :class:`TrackingGains` or :class:`Controller`.
+        and limits on the twist), the path of a controller file (``.yaml``), :class:`TrackingGains` or
+        :class:`Controller`.
     control_period_s
         Period at which it acts, s: limits on accelerations need it.
     preview_s
@@ -42,11 +45,12 @@ class ReferencePolicy:
     Raises
     ------
     ValueError
-        for an unknown preset, and for a lead without a first preview above 0.
+        for an unknown preset, a file that is none, and a lead without a first preview above 0.
     """
 
     privileged = False
-    scenario_overrides: Mapping[str, Any] = {}  # an estimate of the slip, if it is to be cancelled
+    # An estimate of the slip, if it is to be cancelled, and what a controller file asks for.
+    scenario_overrides: Mapping[str, Any] = {}
 
     def __init__(
         self,
@@ -54,7 +58,13 @@ class ReferencePolicy:
         control_period_s: float = DEFAULT_CONTROL_PERIOD_S,
         preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S,
     ) -> None:
-        if isinstance(gains, str):
+        self.files: tuple[Path, ...] = ()
+        asked: dict[str, Any] = {}
+        if isinstance(gains, str) and gains.endswith(SUFFIXES):
+            file = load_controller(gains)
+            self.controller, asked = file.controller, file.scenario_overrides
+            self.files = (Path(gains),)
+        elif isinstance(gains, str):
             self.controller = controller(gains)
         elif isinstance(gains, TrackingGains):
             self.controller = Controller(gains=gains)
@@ -64,7 +74,8 @@ class ReferencePolicy:
         self._row = controller_row(self.controller, control_period_s, preview_s)
         self._needed = len(self._scales) if self.controller.lead_s else len(Tracking._fields)
         if self.controller.limits.cancel_slip:
-            self.scenario_overrides = {"estimator": "ekf-slip"}
+            asked = {"estimator": "ekf-slip"} | asked
+        self.scenario_overrides = asked
 
     def predict(
         self,

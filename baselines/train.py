@@ -14,29 +14,27 @@ import json
 import math
 import signal
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import FrameType
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
-from baselines.card import CARD
 from baselines.checkpoint import read_checkpoint, write_checkpoint
+from baselines.evaluate import evaluate, overall_mm
 from baselines.export import export_policy
-from baselines.pool import run_jobs
-from baselines.run import run_seeds, versions
+from baselines.jobs import alone_in, claim
+from baselines.run import versions
 from baselines.sb3 import FormationVecEnv
 from baselines.train_config import TrainConfig
 from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.files import atomic
-from tlf_env.onboard.parts import Policy
-from tlf_env.task.scenario import Scenario
 
 POLICY, CHECKPOINT, CURVE, PLAN, STEPS = (
     "policy.safetensors",
@@ -45,10 +43,7 @@ POLICY, CHECKPOINT, CURVE, PLAN, STEPS = (
     "plan.json",
     "robot_steps",
 )
-FAILED_MM = 1000.0  # what a run counts for in which a robot is lost or touches another
-SMALLEST_MM = 0.1
 OFF_POLICY_STEPS = 64
-MEASURED = ("position_rmse_mm", "error_capped_mean_mm", "torque_rms_Nmm")
 
 
 @dataclass
@@ -66,6 +61,7 @@ def train(
     folder: Path,
     *,
     command: str = "",
+    threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
 ) -> dict[str, Any]:
     """Train with one seed, from where the folder's checkpoint stands, and keep the best policy.
@@ -81,6 +77,8 @@ def train(
     folder
         Gets ``policy.safetensors`` with its card, ``checkpoint.safetensors``, ``curve.json`` and
         TensorBoard's files.
+    threads
+        That step the formations; their number changes no result.
     progress
         Called with the robot steps done and those in all.
 
@@ -98,14 +96,26 @@ def train(
     """
     torch.set_num_threads(1)  # small networks: more threads would only wait for each other
     check_folder(config, seed, folder)
-    envs = make_envs(config)
+    with alone_in(folder):
+        return _train(config, seed, folder, command, threads, progress)
+
+
+def _train(
+    config: TrainConfig,
+    seed: int,
+    folder: Path,
+    command: str,
+    threads: int,
+    progress: Callable[[int, int], None] | None,
+) -> dict[str, Any]:
+    envs = make_envs(config, threads)
     model = make_model(config, envs, seed)
     model.set_logger(Logger(str(folder), tensorboard(folder)))
     if (folder / CHECKPOINT).exists():
         done = Progress(**read_checkpoint(folder / CHECKPOINT, model, envs))
     else:
         done = Progress()
-        spread(model, envs, config.seeds[0])
+        spread_out(model, envs, config.seeds[0])
         judge(model, config, seed, folder, done, command)
     began = time.perf_counter() - done.wall_time_s
     with interrupts() as stop:
@@ -129,10 +139,10 @@ def train(
     return write_curve(folder, config, seed, done)
 
 
-def make_envs(config: TrainConfig) -> FormationVecEnv:
+def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
     """All formations: every episode draws its disturbance among the config's."""
     tasks, shares = config.mixture()
-    envs = FormationVecEnv(tasks, config.formations, mixture=shares)
+    envs = FormationVecEnv(tasks, config.formations, mixture=shares, threads=threads)
     first, end = config.seeds
     if end - first < config.formations:
         raise ValueError(
@@ -193,7 +203,7 @@ def algorithm(config: TrainConfig) -> tuple[Callable[..., Any], str]:
     return RecurrentPPO, "MlpLstmPolicy"
 
 
-def spread(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
+def spread_out(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
     """Bring the formations to different moments of their episodes, as they will be later on.
 
     Without it all of them would start at once, and the first rollouts would show starts only.
@@ -251,49 +261,13 @@ def note(model: Any, done: Progress) -> None:
     model.logger.dump(model.num_timesteps)
 
 
-class Cell(NamedTuple):
-    """One task under one disturbance, over the seeds: medians of the worst robot, and failures."""
-
-    position_rmse_mm: float
-    error_capped_mean_mm: float
-    torque_rms_Nmm: float
-    failed: int  # runs in which a robot was lost or touched another
-    runs: int
-    score_mm: float  # geometric mean of the position RMS, FAILED_MM for a failed run
-
-
-def evaluate(policy: Policy, config: TrainConfig) -> dict[str, Cell]:
-    """Every task and disturbance of ``config.evaluation``, by ``"task, disturbance"``."""
-    seeds = range(*config.evaluation.seeds)
-    return {
-        f"{task}, {disturbance}": cell(policy, scenario, seeds)
-        for (task, disturbance), scenario in config.evaluation_scenarios().items()
-    }
-
-
-def cell(policy: Policy, scenario: Scenario, seeds: range) -> Cell:
-    """One scenario over the seeds."""
-    worst, failed = [], []
-    for record in run_seeds(scenario, policy, seeds):
-        robots = record.metrics()
-        worst.append([max(getattr(robot, name) for robot in robots) for name in MEASURED])
-        failed.append(any(robot.lost or robot.touched for robot in robots))
-    table = np.array(worst)
-    counted = np.where(failed, FAILED_MM, np.clip(table[:, 0], SMALLEST_MM, FAILED_MM))
-    return Cell(
-        **dict(zip(MEASURED, np.median(table, axis=0).tolist(), strict=True)),
-        failed=sum(failed),
-        runs=len(failed),
-        score_mm=float(np.exp(np.log(counted).mean())),
-    )
-
-
 def judge(
     model: Any, config: TrainConfig, seed: int, folder: Path, done: Progress, command: str
 ) -> None:
     """Evaluate the policy, and keep it if none before was as good."""
-    cells = evaluate(model, config)
-    score_mm = math.exp(float(np.mean([math.log(one.score_mm) for one in cells.values()])))
+    seeds = range(*config.evaluation.seeds)
+    cells = evaluate(model, config.evaluation_scenarios(), seeds)
+    score_mm = overall_mm(cells)
     best_mm = min((one["score_mm"] for one in done.evaluations), default=math.inf)
     done.evaluations.append(
         {
@@ -343,7 +317,7 @@ def write_curve(folder: Path, config: TrainConfig, seed: int, done: Progress) ->
 
 
 def check_folder(config: TrainConfig, seed: int, folder: Path) -> None:
-    """Make the folder, or check that it holds this training.
+    """Claim the folder for this training.
 
     Raises
     ------
@@ -356,21 +330,7 @@ def check_folder(config: TrainConfig, seed: int, folder: Path) -> None:
         "sources": sources_digest(),
         "torch": torch.__version__,
     }
-    path = folder / PLAN
-    if not path.exists():
-        with atomic(path, encoding="utf-8") as file:
-            json.dump(plan, file, indent=1)
-            file.write("\n")
-        return
-    try:
-        before = json.loads(path.read_text(encoding="utf-8"))
-    except ValueError as error:
-        raise ValueError(f"{path} is damaged: {error}") from error
-    for name, value in plan.items():
-        if before.get(name) != value:
-            raise ValueError(
-                f"{folder} holds a training with another {name}; take another --out, or remove it"
-            )
+    claim(folder / PLAN, plan, list(plan), "a training")
 
 
 def tensorboard(folder: Path) -> list[Any]:
@@ -403,80 +363,3 @@ def interrupts() -> Iterator[list[int]]:
         yield came
     finally:
         signal.signal(signal.SIGINT, before)
-
-
-def train_seeds(
-    config: TrainConfig,
-    seeds: Sequence[int],
-    folder: Path,
-    *,
-    processes: int = 1,
-    ray_address: str | None = None,
-    command: str = "",
-    progress: Callable[[int, int], None] | None = None,
-) -> list[dict[str, Any]]:
-    """Train with several seeds, each in ``folder/seed_N``; the best policy goes to ``folder``.
-
-    Returns
-    -------
-    list
-        What :func:`train` returns, in the order of the seeds.
-
-    Raises
-    ------
-    ValueError
-        as :func:`train` does; for a number of processes below 1; without a Ray cluster at the address.
-    KeyboardInterrupt
-        after an interrupt, once all trainings have written their checkpoints.
-    """
-    places = {seed: folder / f"seed_{seed}" for seed in seeds}
-    for seed, place in places.items():  # before any of them works for long
-        check_folder(config, seed, place)
-    alone = ray_address is None and processes == 1
-
-    def tell() -> None:
-        if progress is not None:
-            done = sum(_steps_done(place) for place in places.values())
-            progress(min(done, total), total)
-
-    total = config.robot_steps * len(places)
-    curves: dict[int, dict[str, Any]] = {}
-    jobs = [
-        (config, seed, place, command, tell if alone else None) for seed, place in places.items()
-    ]
-    for curve in run_jobs(
-        _train_job, jobs, processes=processes, ray_address=ray_address, ahead=1, meanwhile=tell
-    ):
-        curves[curve["seed"]] = curve
-        tell()
-    best = min(curves, key=lambda seed: kept(curves[seed])["score_mm"])
-    for name in (POLICY, str(Path(POLICY).with_suffix(CARD))):
-        with atomic(folder / name, "wb") as file:
-            file.write((places[best] / name).read_bytes())
-    return [curves[seed] for seed in seeds]
-
-
-def _train_job(
-    config: TrainConfig, seed: int, folder: Path, command: str, tell: Callable[[], None] | None
-) -> dict[str, Any]:
-    """One seed; how far it is stands in a file, so that another process or machine can tell."""
-
-    def progress(done: int, total: int) -> None:
-        with atomic(folder / STEPS) as file:
-            file.write(f"{done}\n")
-        if tell is not None:
-            tell()
-
-    return train(config, seed, folder, command=command, progress=progress)
-
-
-def _steps_done(folder: Path) -> int:
-    try:
-        return int((folder / STEPS).read_text(encoding="utf-8"))
-    except (OSError, ValueError):
-        return 0
-
-
-def kept(curve: dict[str, Any]) -> dict[str, Any]:
-    """The evaluation of the policy that was kept."""
-    return min(curve["evaluations"], key=lambda one: one["score_mm"])

@@ -3,7 +3,9 @@
 import numpy as np
 import pytest
 
-from baselines.policies import enter, make_policy, policy_names
+from baselines.bench import policy_hash
+from baselines.controllers import load_controller
+from baselines.policies import enter, make_policy, overrides_told, policy_names
 from baselines.run import run_policy
 from baselines.stack import StackPolicy
 from tlf_env.onboard.tracking import controller
@@ -58,6 +60,66 @@ def test_the_tuned_reference_runs_on_an_estimate_of_the_slip():
 def test_an_estimator_that_is_set_stands(estimator):
     entry = enter("reference:tuned", load_scenario(horizon_s=0.2, estimator=estimator))
     assert (entry.overrides, entry.scenario.estimator) == ({}, estimator)
+
+
+@pytest.mark.parametrize(
+    ("text", "overrides"),
+    [
+        ("controller: {gains: {k_1_per_s: 0.4}}", {}),
+        ("controller: tuned", {"estimator": "ekf-slip"}),
+        ("controller: tuned\nestimator: ekf", {}),
+        ("controller: consistent\nestimator: truth\nfound: {by: hand}", {"estimator": "truth"}),
+    ],
+)
+def test_a_controller_may_come_from_a_file(text, overrides, tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text(text)
+    entry = enter(f"reference:{path}", SCENARIO)
+    assert entry.overrides == overrides
+    assert entry.policy.controller == load_controller(path).controller
+    assert np.isfinite(run_policy(entry.scenario, entry.policy)["x_mm"]).all()
+
+
+def test_a_controller_file_may_ask_for_its_filter(tmp_path):
+    path = tmp_path / "mine.yaml"
+    path.write_text("controller: tuned\nekf_slip: {fix_variance_mm2: 0.7}")
+    entry = enter(f"reference:{path}", SCENARIO)
+    assert entry.scenario.estimator == "ekf-slip"
+    assert entry.scenario.ekf_slip.fix_variance_mm2 == 0.7
+    assert entry.overrides["ekf_slip"] == entry.scenario.ekf_slip.model_dump()
+    assert overrides_told(entry.overrides) == ["estimator ekf-slip", "ekf_slip of its own"]
+    mine = load_scenario(SCENARIO, ekf_slip={"fix_variance_mm2": 0.2}, estimator="ekf-slip")
+    assert enter(f"reference:{path}", mine).scenario == mine
+
+
+@pytest.mark.parametrize(
+    ("text", "said"),
+    [
+        (None, "cannot read"),
+        ("gains: {}", "controller: Field required"),
+        ("controller: bold", "'bold' is not one of consistent, printed, tuned"),
+        ("controller: {gains: {k_1_per_s: -1}}", "controller.gains.k_1_per_s"),
+        ("controller: tuned\nestimator: own:Filter", "estimator"),
+        ("controller: tuned\nekf: {}", "ekf: unknown key"),
+        ("controller: !!python/object:os.system {}", "is not YAML"),
+    ],
+)
+def test_a_bad_controller_file_is_told_in_one_line(text, said, tmp_path):
+    path = tmp_path / "mine.yaml"
+    if text is not None:
+        path.write_text(text)
+    with pytest.raises(ValueError, match=r"^[^\n]*mine\.yaml[^\n]*$") as told:
+        make_policy(f"reference:{path}", SCENARIO)
+    assert said in str(told.value)
+
+
+def test_a_controller_file_counts_as_the_policys_source(tmp_path):
+    path = tmp_path / "mine.yaml"
+    seen = set()
+    for text in ("controller: tuned", "controller: printed"):
+        path.write_text(text)
+        seen.add(policy_hash("reference", make_policy(f"reference:{path}", SCENARIO)))
+    assert len(seen) == 2
 
 
 def test_the_reference_has_the_scenarios_period():

@@ -94,7 +94,7 @@ def command(tmp_path: Path, *words: str, **changes: object) -> list[str]:
 
 def test_without_its_packages_training_says_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(__import__("sys").modules, "stable_baselines3", None)
-    monkeypatch.delitem(__import__("sys").modules, "baselines.train", raising=False)
+    monkeypatch.delitem(__import__("sys").modules, "baselines.train_seeds", raising=False)
     monkeypatch.setattr("sys.argv", command(tmp_path))
     with pytest.raises(SystemExit) as ended:
         main()
@@ -159,20 +159,27 @@ class TestTraining:
 
     def test_the_first_policy_is_the_reference_and_the_kept_one_the_best(self, tmp_path):
         from baselines import ReferencePolicy
-        from baselines.train import evaluate, kept, train
+        from baselines.evaluate import evaluate
+        from baselines.train import train
+        from baselines.train_seeds import kept
 
         config = load_config({**CONFIG, "network": {"hidden": [16], "action_gain": 1e-9}})
         curve = train(config, 0, tmp_path)
         twist = load_config({**CONFIG, "scenario": {**CONFIG["scenario"], "action": "twist"}})
-        reference = evaluate(ReferencePolicy("tuned", preview_s=(0.5,)), twist)
+        seeds = range(*CONFIG["evaluation"]["seeds"])
+        policy = ReferencePolicy("tuned", preview_s=(0.5,))
+        reference = evaluate(policy, twist.evaluation_scenarios(), seeds)
         for name, cell in curve["evaluations"][0]["cells"].items():
             assert cell["score_mm"] == pytest.approx(reference[name].score_mm, rel=1e-4)
         policy = load_policy(tmp_path / "policy.safetensors")
         assert policy.card.scores["kept"] == kept(curve)
         assert policy.card.residual_base == "tuned"
-        found = {name: cell._asdict() for name, cell in evaluate(policy, config).items()}
+        found = {
+            name: cell._asdict()
+            for name, cell in evaluate(policy, config.evaluation_scenarios(), seeds).items()
+        }
         for name, cell in kept(curve)["cells"].items():
-            assert found[name]["score_mm"] == pytest.approx(cell["score_mm"], rel=1e-3)
+            assert found[name].score_mm == pytest.approx(cell["score_mm"], rel=1e-3)
 
     def test_another_training_in_the_folder_is_refused(self, tmp_path):
         from baselines.train import train

@@ -63,13 +63,16 @@ def run(
     policy: Annotated[
         str,
         typer.Option(
-            help="reference[:GAINS], pure_pursuit, feedback_linearisation, a shipped learned policy, "
-            "FILE.safetensors (with FILE.json), module:factory, FILE.zip (with --trust)."
+            help="reference[:GAINS], reference:FILE.yaml, pure_pursuit, feedback_linearisation, a "
+            "shipped learned policy, FILE.safetensors (with FILE.json), module:factory, "
+            "FILE.zip (with --trust)."
         ),
     ] = "reference",
     gains: Annotated[
         str | None,
-        typer.Option(help="Gains of the reference: consistent (default), printed, tuned."),
+        typer.Option(
+            help="Gains of the reference: consistent (default), printed, tuned, FILE.yaml."
+        ),
     ] = None,
     estimator: Annotated[
         str | None,
@@ -97,7 +100,7 @@ def run(
     ] = False,
 ) -> None:
     """Drive a policy through a scenario to the horizon; a table, a summary, data and figures."""
-    from baselines.policies import enter
+    from baselines.policies import enter, overrides_told
     from baselines.run import run_policy, summary, write_mat, write_record
     from tlf_env.numerics.philox import checked_seed
     from tlf_env.task.scenario import load_scenario, scenario_warnings
@@ -120,8 +123,8 @@ def run(
     name = named_policy(policy, gains)
     driver, chosen, overrides = enter(name, chosen, trust=trust)
     if overrides:
-        told = ", ".join(f"{field} {value}" for field, value in overrides.items())
-        notes.print(f"tlf: note: as {name} asks: {told}", markup=False, soft_wrap=True)
+        told = overrides_told(overrides)
+        notes.print(f"tlf: note: as {name} asks: {', '.join(told)}", markup=False, soft_wrap=True)
     folder = writable_folder(out or Path("results") / chosen.name)
     warn_of_compiling()
     with progress_bar(f"{chosen.name}, {name}") as update:
@@ -430,7 +433,7 @@ def train(
     from baselines.train_config import load_config
 
     try:
-        from baselines.train import kept, train_seeds
+        from baselines.train_seeds import kept, train_seeds
     except ModuleNotFoundError as error:
         raise ValueError(f"training needs {error.name} (pip install 'tlf-env[train]')") from error
     loaded = load_config(config, robot_steps=robot_steps)
@@ -460,7 +463,7 @@ def train(
 
 def training_table(curves: list[dict[str, Any]]) -> Table:
     """What every seed reached on the choosing seeds."""
-    from baselines.train import kept
+    from baselines.train_seeds import kept
 
     table = Table(
         title="geometric mean of the worst robot's position RMS in mm, a failed run counts 1000",
@@ -482,7 +485,67 @@ def training_table(curves: list[dict[str, Any]]) -> Table:
     return table
 
 
-PLACES = ("--out", "--processes", "--ray")
+@app.command()
+def tune(
+    config: Annotated[str, typer.Argument(help="A search: a preset (tuned), or a YAML file.")],
+    trials: Annotated[
+        int | None, typer.Option(help="Trials in all, those of earlier calls included.")
+    ] = None,
+    workers: Annotated[
+        int, typer.Option(help="Processes on this machine; 0: one per core. One repeats exactly.")
+    ] = 1,
+    ray: Annotated[
+        str | None, typer.Option(help="Address of an existing Ray cluster to run on instead.")
+    ] = None,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; results/tune/CONFIG without it.")
+    ] = None,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the result as JSON instead of the table.")
+    ] = False,
+) -> None:
+    """Find a controller's gains, limits and filter; interrupt it and call it again to go on."""
+    from baselines.tune import RESULT, load_tune, run_tune
+
+    search = load_tune(config, trials=trials)
+    folder = out or Path("results") / "tune" / Path(config).stem
+    warn_of_compiling()
+    with progress_bar("tune") as update:
+        result = run_tune(
+            search,
+            folder,
+            workers=workers or os.cpu_count() or 1,
+            ray_address=ray,
+            command="tlf " + " ".join(without_places(sys.argv[1:])),
+            progress=update,
+        )
+    if as_json:
+        typer.echo(json.dumps(result, indent=2, allow_nan=False))
+        return
+    screen.print(tune_table(result["found"]))
+    screen.print(f"In {folder}: {RESULT}; drive it with", soft_wrap=True)
+    screen.print(f"tlf run {search.tasks[0]} --gains {folder / RESULT}", soft_wrap=True)
+
+
+def tune_table(found: dict[str, Any]) -> Table:
+    """The result of a search beside its start, on the seeds of both kinds."""
+    table = Table(title=f"trial {found['trial']}, less is better", box=SIMPLE_HEAD)
+    for heading in ("seeds", "task, disturbance"):
+        table.add_column(heading)
+    for heading in ("cost,\nfound", "cost,\nstart", "failed,\nfound", "failed,\nstart"):
+        table.add_column(heading, justify="right")
+    for seeds in ("tune", "choose"):
+        mine, first = found[seeds]["found"], found[seeds]["start"]
+        for place, row in mine["strata"].items():
+            other = first["strata"][place]
+            costs = (f"{row['cost']:.3f}", f"{other['cost']:.3f}")
+            table.add_row(seeds, place, *costs, str(row["failed"]), str(other["failed"]))
+        scores = (f"{mine['score']:.3f}", f"{first['score']:.3f}")
+        table.add_row(seeds, "all", *scores, str(mine["failed"]), str(first["failed"]))
+    return table
+
+
+PLACES = ("--out", "--processes", "--workers", "--ray")
 
 
 def without_places(words: list[str]) -> list[str]:
@@ -561,7 +624,7 @@ def writable_folder(folder: Path) -> Path:
 def main() -> None:
     """Run the command line; every bad input ends in one line on stderr and exit status 2."""
     try:
-        app(sys.argv[1:] or ["--help"], standalone_mode=False)
+        status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
     except TyperException as error:
         fail(error.format_message(), error.exit_code)
     except ValueError as error:
@@ -570,6 +633,9 @@ def main() -> None:
         fail(str(error), FAILED)
     except (KeyboardInterrupt, typer.Abort):
         fail("interrupted", INTERRUPTED)
+    else:
+        if status == INTERRUPTED:  # how typer tells of Ctrl-C
+            fail("interrupted", INTERRUPTED)
 
 
 def fail(message: str, status: int) -> None:

@@ -1,0 +1,476 @@
+"""The search: the same however it is interrupted, what it may not see, and that its result can be used."""
+
+import json
+import os
+import signal
+import subprocess
+import sys
+import time
+
+import pytest
+import yaml
+
+pytest.importorskip("optuna")
+
+from baselines import tune
+from baselines.controllers import load_controller
+from baselines.policies import enter
+from baselines.reference import ReferencePolicy
+from baselines.tune import (
+    CAPS,
+    Job,
+    Objective,
+    Outcome,
+    Study,
+    TuneConfig,
+    evaluate,
+    load_tune,
+    run_tune,
+)
+from tlf_env.cli import main
+from tlf_env.onboard.tracking import CONTROLLERS, controller
+from tlf_env.task.scenario import load_scenario, presets_folder
+
+SMALL = {
+    "start": "tuned",
+    "search": {
+        "gains.k_1_per_s": {"low": 0.2, "high": 2, "log": True},
+        "gains.k_2_mm2_s": {"low": 0.8, "high": 12, "log": True, "times": "gains.k_3_mm2"},
+        "gains.k_3_mm2": {"low": 1e4, "high": 2e5, "log": True},
+        "ekf_slip.fix_variance_mm2": {"low": 0.05, "high": 20, "log": True},
+        "lead_s": {"low": 0, "high": 0.05},
+    },
+    "tasks": ["infinity"],
+    "disturbances": ["nominal", "noise"],
+    "seeds": {"first": 0, "count": 2},
+    "choose": {"first": 10_000, "count": 2, "finalists": 2},
+    "horizon_s": 2,
+    "trials": 7,
+    "startup_trials": 3,
+    "objective": {"settled_formation_rmse_mm": 0},
+}
+COMMAND = [sys.executable, "-c", "from tlf_env.cli import main; main()", "tune"]
+
+
+def config(**fields):
+    return TuneConfig.model_validate({**SMALL, **fields})
+
+
+def quick(settings, job):
+    """A drive that takes no time: high gains fail on noise."""
+    gain, variance = job.values["gains.k_1_per_s"], job.values["ekf_slip.fix_variance_mm2"]
+    strata, total = {}, 0
+    for i, place in enumerate(("infinity, nominal", "infinity, noise")):
+        failed = 2 if i == 0 and gain > 1.5 else 0
+        total += failed
+        cost = abs(gain - 0.8) + variance / 100 + job.seeds[0] / 1e6 + failed
+        strata[place] = {"cost": cost, "failed": failed} | dict.fromkeys(CAPS, 1.0)
+        if total >= job.too_many.get(place, 99):
+            break
+    score = sum(row["cost"] for row in strata.values()) / len(strata)
+    return Outcome(job.number, score, total, 2 * len(strata), len(strata) < 2, strata)
+
+
+def trials(folder, settings):
+    """Everything about the trials but when they were."""
+    return [
+        (t.number, t.state.name, t.params, t.value, t.user_attrs)
+        for t in Study(settings, folder).trials()
+    ]
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """Folder and result of a search that nobody interrupted."""
+    folder = tmp_path_factory.mktemp("whole")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tune, "evaluate", quick)
+        return folder, run_tune(config(), folder)
+
+
+def test_a_search_that_is_interrupted_is_the_search_that_was_not(tmp_path, monkeypatch, whole):
+    left = [0, 5, 5]
+
+    def drive(settings, job):
+        if left and (job.number, job.seeds) == (left[0], [0, 1]):
+            left.pop(0)
+            raise KeyboardInterrupt
+        return quick(settings, job)
+
+    monkeypatch.setattr(tune, "evaluate", drive)
+    while left:
+        finished = left[0]
+        with pytest.raises(KeyboardInterrupt):
+            run_tune(config(), tmp_path)
+        states = [state for _, state, *_ in trials(tmp_path, config())]
+        assert len([s for s in states if s in ("COMPLETE", "PRUNED")]) == finished
+    assert run_tune(config(), tmp_path) == whole[1]
+    assert trials(tmp_path, config()) == trials(whole[0], config())
+    written = [(folder / tune.RESULT).read_text() for folder in (tmp_path, whole[0])]
+    assert written[0] == written[1]
+
+
+@pytest.mark.parametrize("write", ["set_trial_user_attr", "set_trial_state_values"])
+def test_a_trial_that_was_driven_and_not_stored_whole_is_driven_again(
+    tmp_path, monkeypatch, whole, write
+):
+    """The process may end between any two writes to the database."""
+    monkeypatch.setattr(tune, "evaluate", quick)
+    study = Study(config(), tmp_path)
+
+    real = getattr(study._study._storage, write)
+
+    def stops(*words, **named):
+        if len(study.trials("COMPLETE", "PRUNED")) == 4:
+            raise KeyboardInterrupt
+        return real(*words, **named)
+
+    monkeypatch.setattr(study._study._storage, write, stops)
+    jobs = study.jobs()
+    for _ in range(4):
+        study.tell(quick(config(), next(jobs)))
+    last = quick(config(), next(jobs))
+    with pytest.raises(KeyboardInterrupt):
+        study.tell(last)
+    run_tune(config(), tmp_path)
+    assert trials(tmp_path, config()) == trials(whole[0], config())
+
+
+def test_what_is_finished_is_not_driven_again_and_more_trials_go_on(tmp_path, monkeypatch, whole):
+    driven = []
+
+    def drive(settings, job):
+        driven.append((job.number, job.seeds[0]))
+        return quick(settings, job)
+
+    monkeypatch.setattr(tune, "evaluate", drive)
+    run_tune(config(trials=4), tmp_path)
+    before = len(driven)
+    run_tune(config(trials=4), tmp_path)
+    assert len(driven) == before
+    run_tune(config(), tmp_path)
+    assert [n for n, seed in driven if seed == 0] == list(range(7))
+    assert len(set(driven)) == len(driven)
+    assert trials(tmp_path, config()) == trials(whole[0], config())
+
+
+@pytest.mark.parametrize(
+    ("change", "named"),
+    [
+        ({"sampler_seed": 1}, "sampler_seed"),
+        ({"seeds": {"first": 1, "count": 2}}, "seeds"),
+        ({"start": {"gains": {"k_1_per_s": 0.5, "k_2_mm2_s": 3e4}, "lead_s": 0.01}}, "start"),
+        ({"disturbances": ["noise", "nominal"]}, "disturbances"),
+    ],
+)
+def test_another_search_in_the_same_folder_is_refused(tmp_path, monkeypatch, change, named):
+    monkeypatch.setattr(tune, "evaluate", quick)
+    Study(config(), tmp_path)
+    with pytest.raises(ValueError, match=f"holds a search of another {named}; take another --out"):
+        run_tune(config(**change), tmp_path)
+
+
+def test_a_task_whose_file_changed_is_refused(tmp_path):
+    path = tmp_path / "round.yaml"
+    text = "trajectory: {{type: circle, radius_mm: 800, speed_mm_s: {}}}\n"
+    path.write_text(text.format(200))
+    Study(config(tasks=[str(path)]), tmp_path / "out")
+    path.write_text(text.format(300))
+    with pytest.raises(ValueError, match="holds a search of another scenarios"):
+        Study(config(tasks=[str(path)]), tmp_path / "out")
+
+
+def test_two_at_once_in_a_folder_are_refused(tmp_path, monkeypatch):
+    def drive(settings, job):
+        with pytest.raises(ValueError, match="another process is at work in"):
+            run_tune(config(), tmp_path)
+        return quick(settings, job)
+
+    monkeypatch.setattr(tune, "evaluate", drive)
+    assert run_tune(config(trials=1), tmp_path) == run_tune(config(trials=1), tmp_path)
+
+
+def test_a_database_that_is_none_is_told(tmp_path):
+    (tmp_path / tune.STUDY).write_bytes(b"no database, " * 100)
+    with pytest.raises(ValueError, match=r"study\.db cannot be read"):
+        Study(config(), tmp_path)
+
+
+def test_the_seeds_for_choosing_choose(tmp_path, monkeypatch):
+    """The best on the search's seeds is not the result if another is better on the others."""
+
+    def drive(settings, job):
+        outcome = quick(settings, job)
+        if job.seeds[0] < 10_000:
+            return outcome
+        assert job.too_many == {}
+        return outcome._replace(score=-outcome.score)
+
+    monkeypatch.setattr(tune, "evaluate", drive)
+    found = run_tune(config(), tmp_path)["found"]
+    assert len(found["finalists"]) in (2, 3)  # the start too, if it is not among the best
+    assert 0 in [row["trial"] for row in found["finalists"]]
+    tuned = [row["tune"] for row in found["finalists"]]
+    assert tuned == sorted(tuned, reverse=True)
+    assert found["choose"]["found"]["score"] < found["choose"]["start"]["score"] or (
+        found["trial"] == 0
+    )
+
+
+def test_a_trial_that_fails_more_than_the_start_is_stopped(tmp_path, monkeypatch):
+    monkeypatch.setattr(tune, "evaluate", quick)
+    run_tune(config(trials=12), tmp_path)
+    for _, state, values, _, attributes in trials(tmp_path, config(trials=12)):
+        fails = values["gains.k_1_per_s"] > 1.5
+        assert state == ("PRUNED" if fails else "COMPLETE")
+        assert len(attributes[tune.SCORES]["strata"]) == (1 if fails else 2)
+
+
+def test_a_failed_run_costs_more_than_any_other():
+    objective = Objective(failed=0.01)
+    worst = dict.fromkeys(CAPS, 1000000000.0)
+    best = dict.fromkeys(CAPS, 0.0)
+    assert objective.cost(best, True) > objective.cost(worst, False) > objective.cost(best, False)
+    assert objective.cost(best, True) == objective.cost(worst, True)
+    for name in CAPS:
+        assert objective.cost({**best, name: 1.0}, False) > objective.cost(best, False)
+
+
+def test_the_result_is_a_controller_that_scores_the_same(tmp_path):
+    settings = config(trials=3, startup_trials=1)
+    result = run_tune(settings, tmp_path, command="tlf tune x.yaml")
+    found, path = result["found"], str(tmp_path / tune.RESULT)
+    assert yaml.safe_load((tmp_path / tune.RESULT).read_text()) == result
+    assert json.loads(json.dumps(result)) == result
+    study = Study(settings, tmp_path)
+    best = settings.built(study.values(found["trial"]))
+    loaded = load_controller(path)
+    assert (loaded.controller, loaded.ekf_slip) == (best.controller, best.ekf_slip)
+    assert ReferencePolicy(path).controller == best.controller
+    entry = enter(f"reference:{path}", load_scenario(horizon_s=2.0, plant="batch"))
+    assert entry.policy.controller == best.controller
+    assert (entry.scenario.estimator, entry.scenario.ekf_slip) == ("ekf-slip", best.ekf_slip)
+    json.dumps(entry.overrides)
+    (again,) = tune.run_seeds(entry.scenario, entry.policy, [0])
+    job = Job(0, study.values(found["trial"]), [0], {})
+    alone = evaluate(config(disturbances=["nominal"]), job).strata["infinity, nominal"]
+    assert tune.measured(again)[0] == {name: alone[name] for name in CAPS}
+    set_by_hand = load_scenario(ekf_slip={"fix_variance_mm2": 0.5}, estimator="ekf")
+    assert enter(f"reference:{path}", set_by_hand).overrides == {}
+
+
+@pytest.mark.slow
+def test_processes_drive_the_same_trials(tmp_path):
+    settings = config(trials=4, startup_trials=10, stop_after_failed=None, disturbances=["nominal"])
+    one, two = (
+        run_tune(settings, tmp_path / f"{n}", workers=n) for n in (1, 2)
+    )  # at random: no proposal depends on an outcome
+    assert one == two
+
+
+@pytest.mark.slow
+def test_a_search_that_is_killed_loses_no_finished_trial(tmp_path):
+    path = tmp_path / "search.yaml"
+    path.write_text(yaml.safe_dump({**SMALL, "horizon_s": 6, "trials": 30}))
+    settings = load_tune(path)
+
+    def started(folder):
+        return subprocess.Popen(
+            [*COMMAND, str(path), "--out", str(folder), "--json"],
+            stdout=subprocess.PIPE,
+            start_new_session=True,
+        )
+
+    def finished(folder):
+        if not (folder / tune.STUDY).exists():
+            return []
+        try:
+            return [t for t in trials(folder, settings) if t[1] in ("COMPLETE", "PRUNED")]
+        except ValueError:  # not made whole yet
+            return []
+
+    folder = tmp_path / "killed"
+    for enough in (2, 9):
+        process = started(folder)
+        try:
+            end = time.monotonic() + 120
+            while len(finished(folder)) < enough:
+                assert time.monotonic() < end
+                assert process.poll() is None
+                time.sleep(0.02)
+        finally:
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+        before = finished(folder)
+        assert len(before) < 30
+        assert finished(folder) == before
+    results = []
+    for where in (folder, tmp_path / "whole"):
+        process = started(where)
+        out, _ = process.communicate(timeout=300)
+        assert process.returncode == 0
+        results.append(json.loads(out))
+    assert results[0] == results[1]
+    assert finished(folder)[: len(before)] == before
+    assert trials(folder, settings) == trials(tmp_path / "whole", settings)
+
+
+@pytest.mark.slow
+def test_a_ray_cluster_drives_the_same_trials(tmp_path):
+    pytest.importorskip("ray")
+    from ray.cluster_utils import Cluster
+
+    settings = config(trials=4, startup_trials=10, stop_after_failed=None)
+    cluster = Cluster(
+        initialize_head=True, head_node_args={"num_cpus": 2, "include_dashboard": False}
+    )
+    try:
+        far = run_tune(settings, tmp_path / "ray", ray_address=cluster.address)
+    finally:
+        cluster.shutdown()
+    assert far == run_tune(settings, tmp_path / "here")
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"start": "bold"}, "'bold' is not one of consistent, printed, tuned"),
+        ({"start": {"gains": {"k_9": 1}}}, "start.gains.k_9: unknown key"),
+        ({"start": "printed"}, "the start has 6.91667e-05; it must lie within 0.8 and 12"),
+        (
+            {"start": "consistent", "search": {"limits.lateral_error_mm": {"low": 1, "high": 9}}},
+            "search.limits.lateral_error_mm: the start has None",
+        ),
+        ({"start": {"limits": {"cancel_slip": 3}}}, "cancel_slip"),
+        ({"estimator": "kalman"}, "estimator"),
+        ({"estimator": "ekf"}, "needs estimator 'ekf-slip'"),
+        ({"ekf_slip": {"fix_variance_mm2": -1}}, "fix_variance_mm2"),
+        ({"ekf_slip": {"fix_variance_mm2": 30}}, "the start has 30"),
+        ({"search": {}}, "search"),
+        ({"search": {"gains.k_9": {"low": 1, "high": 2}}}, "'gains.k_9' is not one of gains.k_1_"),
+        ({"search": {"limits.cancel_slip": {"low": 0, "high": 1}}}, "'limits.cancel_slip' is not"),
+        ({"search": {"lead_s": {"low": 1, "high": 0}}}, "low 1 must be below high 0"),
+        ({"search": {"lead_s": {"low": 0, "high": 1, "log": True}}}, "above 0 with log true"),
+        ({"search": {"lead_s": {"low": -1, "high": 1}}}, "search.lead_s, low: "),
+        ({"search": {"lead_s": {"low": 0, "high": 1, "steps": 3}}}, "search.lead_s.steps: unknown"),
+        (
+            {"search": {"lead_s": {"low": 0, "high": 1, "times": "lead_s"}}},
+            "own range has no times",
+        ),
+        ({"search": {"lead_s": {"low": 0, "high": 1, "times": "lead"}}}, "'lead' is not one of"),
+        ({"tasks": ["no_such"]}, "no_such"),
+        ({"tasks": ["infinity", "infinity"]}, "named once"),
+        ({"disturbances": ["no_such"]}, "no_such"),
+        ({"disturbances": []}, "disturbances"),
+        ({"seeds": {"first": 20_000, "count": 3}}, "20000 and above are for tables"),
+        ({"seeds": {"first": 9_999, "count": 2}}, "seeds 9999 to 10000 must lie within 0 to 9999"),
+        ({"choose": {"first": 19_999, "count": 2}}, "choose: seeds 19999 to 20000 must lie within"),
+        ({"choose": {"first": 0, "count": 2}}, "must lie within 10000 to 19999"),
+        ({"choose": {"first": 10_000, "count": 2, "finalists": 0}}, "choose.finalists"),
+        ({"horizon_s": 0.03}, "horizon_s"),
+        ({"horizon_s": 15, "objective": {}}, "horizon_s 15 must be above 15"),
+        ({"trials": 0}, "trials"),
+        ({"objective": {"failed": 0}}, "objective.failed"),
+        ({"objective": {"speed": 1}}, "objective.speed: unknown key"),
+        ({"workers": 2}, "workers: unknown key"),
+    ],
+)
+def test_bad_input_is_one_line_and_writes_nothing(change, said, tmp_path, monkeypatch, capsys):
+    (tmp_path / "search.yaml").write_text(yaml.safe_dump({**SMALL, **change}))
+    assert said in refused(["search.yaml"], tmp_path, monkeypatch, capsys)
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("no_such", "'no_such' is neither tuned nor a .yaml file"),
+        ("no_such.yaml", "cannot read no_such.yaml"),
+        ("list.yaml", "must hold a mapping"),
+        ("search.yaml --trials 0", "trials: Input should be greater than or equal to 1, got 0"),
+        ("search.yaml --workers -1", "workers -1 must be at least 1"),
+    ],
+)
+def test_bad_words_are_one_line_and_write_nothing(words, said, tmp_path, monkeypatch, capsys):
+    (tmp_path / "search.yaml").write_text(yaml.safe_dump(SMALL))
+    (tmp_path / "list.yaml").write_text("[1, 2]")
+    assert said in refused(words.split(), tmp_path, monkeypatch, capsys)
+
+
+def refused(words, tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "argv", ["tlf", "tune", *words, "--out", "out"])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 2
+    told = capsys.readouterr().err
+    assert "\n" not in told.strip()
+    assert not (tmp_path / "out").exists()
+    return told
+
+
+def test_the_command_prints_its_result(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(tune, "evaluate", quick)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "search.yaml").write_text(yaml.safe_dump(SMALL))
+    printed = []
+    for words in (["--json", "--trials", "3"], []):
+        monkeypatch.setattr(sys, "argv", ["tlf", "tune", "search.yaml", *words])
+        main()
+        printed.append(capsys.readouterr().out)
+    result = json.loads(printed[0])
+    folder = tmp_path / "results" / "tune" / "search"
+    assert yaml.safe_load((folder / tune.RESULT).read_text())["found"]["search"]["trials"] == 7
+    assert result["found"]["command"] == "tlf tune search.yaml --json --trials 3"
+    assert result["found"]["search"]["trials"] == 3
+    assert "less is better" in printed[1]
+    assert "--gains results/tune/search/tuned.yaml" in " ".join(printed[1].split())
+
+
+def test_an_interrupt_is_told_and_no_success(tmp_path, monkeypatch, capsys):
+    def drive(settings, job):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tune, "evaluate", drive)
+    monkeypatch.setattr(sys, "argv", ["tlf", "tune", "tuned", "--out", str(tmp_path)])
+    with pytest.raises(SystemExit) as end:
+        main()
+    assert end.value.code == 130
+    assert capsys.readouterr().err == "tlf: interrupted\n"
+
+
+def test_the_start_is_the_first_trial(tmp_path):
+    """Whatever the search finds is at least as good on the seeds for choosing."""
+    settings = load_tune("tuned")
+    job = next(Study(settings, tmp_path).jobs())
+    file = settings.built(job.values)
+    assert (job.number, file.controller) == (0, controller("tuned"))
+    assert file.ekf_slip == settings.ekf_slip
+
+
+def test_the_committed_result_is_of_the_committed_search():
+    folder = presets_folder() / "tune"
+    result = load_controller(folder / "tuned-result.yaml")
+    search = load_tune("tuned").model_dump(mode="json")
+    assert set(result.found["search"]["search"]) == set(search["search"])
+    assert result.found["search"]["seeds"] == search["seeds"]
+    assert result.found["choose"]["found"]["score"] <= result.found["choose"]["start"]["score"]
+
+
+def test_a_search_may_say_its_start_in_numbers():
+    numbers = CONTROLLERS["tuned"].model_dump()
+    assert config(start=numbers) == config()
+
+
+def test_a_ratio_follows_what_it_is_of():
+    settings = config()
+    values = settings.start_values
+    assert values["gains.k_2_mm2_s"] == 6.4
+    gains = settings.built({**values, "gains.k_3_mm2": 2e4, "gains.k_2_mm2_s": 3}).controller.gains
+    assert (gains.k_2_mm2_s, gains.k_3_mm2) == (6e4, 2e4)
+
+
+def test_without_optuna_the_command_says_so(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "optuna", None)
+    with pytest.raises(ValueError, match=r"pip install 'tlf-env\[tune\]'"):
+        run_tune(config(), tmp_path / "out")
+    assert not (tmp_path / "out").exists()
