@@ -174,10 +174,7 @@ class TestTraining:
         policy = load_policy(tmp_path / "policy.safetensors")
         assert policy.card.scores["kept"] == kept(curve)
         assert policy.card.residual_base == "tuned"
-        found = {
-            name: cell._asdict()
-            for name, cell in evaluate(policy, config.evaluation_scenarios(), seeds).items()
-        }
+        found = evaluate(policy, config.evaluation_scenarios(), seeds)
         for name, cell in kept(curve)["cells"].items():
             assert found[name].score_mm == pytest.approx(cell["score_mm"], rel=1e-3)
 
