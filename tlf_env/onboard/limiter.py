@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law
-from tlf_env.physics.parameters import Frozen, Positive
+from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
 
 class TwistLimits(Frozen):
@@ -22,6 +22,10 @@ class TwistLimits(Frozen):
     acceleration_mm_s2: Positive | None = None  # of u₁
     yaw_acceleration_rad_s2: Positive | None = None  # of u₂
     lateral_acceleration_mm_s2: Positive | None = None  # of |u₁ u₂|
+    turning_lever_mm: NonNegative = 0.0
+    turning_acceleration_mm_s2: NonNegative = 0.0
+    ellipse: NonNegative = 0.0
+    reverse_mm_s: NonNegative | None = None  # of u₁ backward
     cancel_slip: bool = False  # take the estimated slip off the wheels' twist
 
 
@@ -33,6 +37,10 @@ class Limits(NamedTuple):
     step_1: float  # mm/s per control step
     step_2: float  # rad/s per control step
     lateral: float
+    lever: float
+    least: float
+    ellipse: float
+    reverse: float  # mm/s
     slip: float  # 1 if the estimated slip counts, else 0
 
 
@@ -48,6 +56,10 @@ def limits_row(limits: TwistLimits, period_s: float) -> Limits:
         finite(limits.acceleration_mm_s2, period_s),
         finite(limits.yaw_acceleration_rad_s2, period_s),
         finite(limits.lateral_acceleration_mm_s2),
+        limits.turning_lever_mm,
+        limits.turning_acceleration_mm_s2 * period_s,
+        limits.ellipse,
+        finite(limits.reverse_mm_s),
         1.0 if limits.cancel_slip else 0.0,
     )
 
@@ -84,12 +96,19 @@ def limited_twist(
     reference's speed gives way first, and then the yaw rate.
     """
     s_1, s_2 = limits.slip * delta_1, limits.slip * delta_2
-    b_1 = within(u_1, last_1 + s_1, limits.step_1)
     b_2 = within(u_2, last_2 + s_2, limits.step_2)
+    step_1 = limits.step_1
+    if limits.lever > 0.0:
+        step_1 = step_1 - limits.lever * abs(b_2 - last_2 - s_2)
+    if limits.ellipse > 0.0:
+        used = min(abs((last_1 + s_1) * (last_2 + s_2)) / limits.lateral, 1.0)
+        step_1 = step_1 * (1.0 - limits.ellipse * used * used)
+    step_1 = max(step_1, min(limits.least, limits.step_1))
+    b_1 = within(u_1, last_1 + s_1, step_1)
     if abs(b_1 * b_2) > limits.lateral:
         enough = max(limits.lateral / abs(b_2), abs(cruise))
         if abs(b_1) > enough:
-            b_1 = within(math.copysign(enough, b_1), last_1 + s_1, limits.step_1)
+            b_1 = within(math.copysign(enough, b_1), last_1 + s_1, step_1)
     if abs(b_1 * b_2) > limits.lateral:
         b_2 = math.copysign(limits.lateral / abs(b_1), b_2)
     return b_1 - s_1, b_2 - s_2
