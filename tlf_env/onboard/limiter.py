@@ -25,7 +25,6 @@ class TwistLimits(Frozen):
     turning_lever_mm: NonNegative = 0.0
     turning_acceleration_mm_s2: NonNegative = 0.0
     ellipse: NonNegative = 0.0
-    reverse_mm_s: NonNegative | None = None  # of u₁ backward
     cancel_slip: bool = False  # take the estimated slip off the wheels' twist
 
 
@@ -40,7 +39,6 @@ class Limits(NamedTuple):
     lever: float
     least: float
     ellipse: float
-    reverse: float  # mm/s
     slip: float  # 1 if the estimated slip counts, else 0
 
 
@@ -59,7 +57,6 @@ def limits_row(limits: TwistLimits, period_s: float) -> Limits:
         limits.turning_lever_mm,
         limits.turning_acceleration_mm_s2 * period_s,
         limits.ellipse,
-        finite(limits.reverse_mm_s),
         1.0 if limits.cancel_slip else 0.0,
     )
 

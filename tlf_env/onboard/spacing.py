@@ -17,16 +17,14 @@ from tlf_env.physics.parameters import Frozen, Positive
 class Spacing(Frozen):
     """How a robot keeps its distance.
 
-    The speed at which the centres may approach is ``gain_per_s`` times what their distance is beyond
-    ``distance_mm``, and where that were more than ``braking_mm_s2`` can stop, the speed that it can. Nearer
-    than ``distance_mm`` they have to part. ``lever_mm`` weighs turning against driving: the longer, the
-    less a robot turns to get out of the way.
+    Near ``distance_mm`` between the centres, the speed at which they may approach is ``gain_per_s`` times
+    the distance beyond it (nearer, they have to part); farther away it is the speed that
+    ``braking_mm_s2`` can stop.
     """
 
-    distance_mm: Positive = 250.0
+    distance_mm: Positive = 265.0
     gain_per_s: Positive = 2.0
     braking_mm_s2: Positive = 100.0
-    lever_mm: Positive = 100.0
     outline_offset_mm: Positive = 30.0  # centre of the outline, behind c
 
 
@@ -36,7 +34,6 @@ class SpacingRow(NamedTuple):
     distance: float
     gain: float
     braking: float
-    lever: float
     behind: float
 
 
@@ -54,26 +51,29 @@ class Heard(NamedTuple):
 def spacing_row(spacing: Spacing | None) -> SpacingRow:
     """The numbers as the compiled law takes them."""
     if spacing is None:
-        return SpacingRow(0.0, 1.0, 1.0, 1.0, 1.0)
+        return SpacingRow(0.0, 1.0, 1.0, 1.0)
     return SpacingRow(
         spacing.distance_mm,
         spacing.gain_per_s,
         spacing.braking_mm_s2,
-        spacing.lever_mm,
         spacing.outline_offset_mm,
     )
 
 
 @law
-def closing_speed(room: float, row: SpacingRow) -> float:
-    """Speed (mm/s) at which two centres may approach that have ``room`` (mm) left.
+def approach_speed(room: float, leaving: float, row: SpacingRow) -> float:
+    """Speed (mm/s) towards another centre that has ``room`` (mm) left and itself leaves at ``leaving``.
 
-    Linear near 0 and the root of a constant deceleration beyond, with one slope where they meet.
+    What leaves may stop, and needs its way for it; what comes closer is met that much slower. Linear
+    near 0 and the root of a constant deceleration beyond, with one slope where they meet.
     """
+    if leaving > 0.0:
+        room += 0.5 * leaving * leaving / row.braking
+        leaving = 0.0
     linear = row.braking / (row.gain * row.gain)
     if room <= linear:
-        return row.gain * room
-    return math.sqrt(row.braking * (2.0 * room - linear))
+        return leaving + row.gain * room
+    return leaving + math.sqrt(row.braking * (2.0 * room - linear))
 
 
 @law
@@ -90,12 +90,8 @@ def spaced_twist(u_1: float, u_2: float, heard: Heard, row: SpacingRow) -> tuple
     leaving = n_forward * (heard.u_1 * heard.cos_turn + swing * heard.sin_turn) + n_right * (
         swing * heard.cos_turn - heard.u_1 * heard.sin_turn
     )
-    per_turn = n_right * behind
-    excess = (
-        n_forward * u_1 + per_turn * u_2 - leaving - closing_speed(distance - row.distance, row)
-    )
+    approach = approach_speed(distance - row.distance, leaving, row)
+    excess = n_forward * u_1 + n_right * behind * u_2 - approach
     if excess <= 0.0:
         return u_1, u_2
-    weight = n_forward * n_forward + (per_turn / row.lever) * (per_turn / row.lever)
-    share = excess / weight
-    return u_1 - share * n_forward, u_2 - share * per_turn / (row.lever * row.lever)
+    return u_1 - excess * n_forward, u_2 - excess * n_right / behind
