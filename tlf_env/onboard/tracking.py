@@ -77,9 +77,11 @@ CONTROLLERS: dict[str, Controller] = {
         limits=TwistLimits(
             forward_error_mm=440.0,
             lateral_error_mm=150.0,
-            acceleration_mm_s2=153.0,
+            acceleration_mm_s2=165.0,
+            turning_acceleration_mm_s2=140.0,
             yaw_acceleration_rad_s2=8.2,
-            lateral_acceleration_mm_s2=177.0,
+            lateral_acceleration_mm_s2=150.0,
+            reverse_mm_s=20.0,
             cancel_slip=True,
         ),
         spacing=Spacing(),

@@ -112,6 +112,7 @@ def twist_action(
     observation: np.ndarray, scales: np.ndarray, row: ControllerRow, u_1: float, u_2: float
 ) -> tuple[float, float]:
     """The ``twist`` action that asks the wheels for a twist (mm/s, rad/s), within the limits."""
+    u_1 = max(u_1, -row.limits.reverse)
     if row.spacing.distance > 0.0 and observation[IS_LEADER] * scales[IS_LEADER] < 0.5:
         u_1, u_2 = spaced_twist(u_1, u_2, heard_predecessor(observation, scales), row.spacing)
     v_1, v_2 = limited_twist(

@@ -31,7 +31,7 @@ BUILT_IN_ESTIMATORS = ("ekf", "ekf-slip", "truth")
 DEFAULT_CONTROL_PERIOD_S = 0.02
 DEFAULT_PREVIEW_S = (0.5, 1.0)
 SETTLE_FRACTION = 0.4
-START_MARGIN_MM = 1.0  # between outlines at the start
+START_MARGIN_MM = 25.0  # between outlines at the start, to stop in if both drift
 DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
 
