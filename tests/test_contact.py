@@ -13,6 +13,7 @@ from tlf_env.physics.openloop import advance_open_loop
 from tlf_env.physics.parameters import RobotParameters, body_array
 from tlf_env.physics.pymunk_plant import COLLISION_SLOP_MM, ITERATIONS, PymunkPlant
 from tlf_env.physics.state import Motion
+from tlf_env.task.formation import reference_table
 
 OUTLINES_MM = 2 * ROBOT.outline_radius_mm
 AHEAD_MM = (
@@ -226,8 +227,13 @@ def test_a_collision_far_away_changes_nothing_here():
 
 def leader_states(robots: int, spacing_mm: float) -> np.ndarray:
     """Motion, memory and estimate of robot_0 over time; the others stand still."""
-    env = tlf_env.parallel_env(robots=robots, start_spacing_mm=spacing_mm, end_on=())
-    env.reset(seed=3)
+    env = tlf_env.parallel_env(robots=robots, end_on=())
+    x, y, theta = reference_table(env.scenario)[0, :3]
+    behind = spacing_mm * np.arange(robots)
+    poses = np.column_stack(
+        [x + behind * np.sin(theta), y - behind * np.cos(theta), np.full(robots, theta)]
+    )
+    env.reset(seed=3, options={"poses": poses})
     rng = np.random.default_rng(3)
     arrays, rows = env.formation.arrays, []
     actions = {agent: np.zeros(2) for agent in env.possible_agents}

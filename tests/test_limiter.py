@@ -54,6 +54,12 @@ def place(name: str) -> int:
     return Tracking._fields.index(name)
 
 
+def step_now(last: tuple[float, float], slip: tuple[float, float]) -> float:
+    """Most that u₁ may change by in a step, mm/s: the less, the sharper the turn."""
+    used = min(abs((last[0] + slip[0]) * (last[1] + slip[1])) / ALL.lateral, 1.0)
+    return ALL.step_1 - ALL.turning_loss * used * used
+
+
 def batch(rows: int = 64, seed: int = 0) -> np.ndarray:
     return np.random.default_rng(seed).uniform(-1, 1, (rows, ENTRIES)).astype(np.float32)
 
@@ -89,7 +95,7 @@ def test_limits_hold(u, last, slip, cruise):
     """Of the body's twist, the wheels' plus the slip."""
     v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
     b_1, b_2 = v_1 + slip[0], v_2 + slip[1]
-    assert abs(v_1 - last[0]) <= ALL.step_1 + 1e-9
+    assert abs(v_1 - last[0]) <= step_now(last, slip) + 1e-9
     assert abs(b_1 * b_2) <= ALL.lateral * (1 + 1e-9) + 1e-9
     if abs(v_2 - last[1]) > ALL.step_2 + 1e-9:
         assert abs(b_1 * b_2) == pytest.approx(ALL.lateral, rel=1e-6)
@@ -102,9 +108,9 @@ def test_catching_up_gives_way_before_turning_and_turning_before_the_references_
     u, last, slip, cruise
 ):
     v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
-    unlimited = TUNED.model_copy(update={"lateral_acceleration_mm_s2": None})
-    w_1, w_2 = limited_twist(*u, *last, *slip, cruise, limits_row(unlimited, PERIOD_S))
-    fastest_brake = abs(last[0] + slip[0]) - ALL.step_1
+    unlimited = ALL._replace(step_1=step_now(last, slip), turning_loss=0.0, lateral=math.inf)
+    w_1, w_2 = limited_twist(*u, *last, *slip, cruise, unlimited)
+    fastest_brake = abs(last[0] + slip[0]) - unlimited.step_1
     if abs(v_1 + slip[0]) < abs(w_1 + slip[0]) - 1e-9:  # slower, and no more than it had to be
         assert abs(v_1 + slip[0]) >= abs(cruise) - 1e-9
     if abs(v_2 + slip[1]) < abs(w_2 + slip[1]) - 1e-9:  # turning gave way, for speed could not
@@ -152,7 +158,16 @@ def test_the_forward_error_saturates_smoothly(e, other):
 def test_limits_on_accelerations_are_per_second():
     half = limits_row(TUNED, PERIOD_S / 2)
     assert (2 * half.step_1, 2 * half.step_2) == (ALL.step_1, ALL.step_2)
+    assert 2 * half.turning_loss == ALL.turning_loss
     assert half.lateral == ALL.lateral
+
+
+def test_acceleration_at_the_lateral_limit_is_the_one_for_turns():
+    last = (250.0, TUNED.lateral_acceleration_mm_s2 / 250.0)
+    v_1, _ = limited_twist(1000.0, last[1], *last, 0.0, 0.0, 1000.0, ALL)
+    assert v_1 - last[0] == pytest.approx(TUNED.turning_acceleration_mm_s2 * PERIOD_S)
+    straight, _ = limited_twist(1000.0, 0.0, 250.0, 0.0, 0.0, 0.0, 1000.0, ALL)
+    assert straight - 250.0 == pytest.approx(TUNED.acceleration_mm_s2 * PERIOD_S)
 
 
 @pytest.mark.parametrize("field", [name for name in TwistLimits.model_fields if "_mm" in name])
@@ -246,6 +261,7 @@ def test_on_board_and_from_outside_it_is_the_same_policy():
 
 READ_WITH_LIMITS = ("command_u_1", "command_u_2", "slip_1", "slip_2")
 READ = ("e_1", "e_2", "sin_e_3", "cos_e_3", "reference_u_1", "reference_u_2", *READ_WITH_LIMITS)
+READ_OF_OTHERS = ("is_leader", *(name for name in Tracking._fields if "predecessor" in name))
 AHEAD_U = [len(Tracking._fields) + Preview._fields.index(name) for name in ("u_1", "u_2")]
 
 
@@ -255,7 +271,7 @@ def leading(lead_s: float, name: str = "tuned") -> Controller:
 
 def test_without_a_lead_no_preview_is_read():
     rows, other = batch(), batch(seed=1)
-    needed = [place(name) for name in READ]
+    needed = [place(name) for name in (*READ, *READ_OF_OTHERS)]
     other[:, needed] = rows[:, needed]
     policy = ReferencePolicy(controller("tuned").model_copy(update={"lead_s": 0.0}))
     assert policy.predict(rows)[0].tobytes() == policy.predict(other)[0].tobytes()

@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law
-from tlf_env.physics.parameters import Frozen, Positive
+from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
 
 class TwistLimits(Frozen):
@@ -22,6 +22,8 @@ class TwistLimits(Frozen):
     acceleration_mm_s2: Positive | None = None  # of u₁
     yaw_acceleration_rad_s2: Positive | None = None  # of u₂
     lateral_acceleration_mm_s2: Positive | None = None  # of |u₁ u₂|
+    turning_acceleration_mm_s2: Positive | None = None  # of u₁ where |u₁ u₂| is at its limit
+    reverse_mm_s: NonNegative | None = None  # of u₁ backward
     cancel_slip: bool = False  # take the estimated slip off the wheels' twist
 
 
@@ -33,6 +35,8 @@ class Limits(NamedTuple):
     step_1: float  # mm/s per control step
     step_2: float  # rad/s per control step
     lateral: float
+    turning_loss: float  # mm/s per control step, what step_1 loses where |u₁ u₂| is at its limit
+    reverse: float  # mm/s
     slip: float  # 1 if the estimated slip counts, else 0
 
 
@@ -42,12 +46,16 @@ def limits_row(limits: TwistLimits, period_s: float) -> Limits:
     def finite(limit: float | None, factor: float = 1.0) -> float:
         return math.inf if limit is None else limit * factor
 
+    most, least = limits.acceleration_mm_s2, limits.turning_acceleration_mm_s2
+    turning_loss = 0.0 if most is None or least is None else max(most - least, 0.0)
     return Limits(
         finite(limits.forward_error_mm),
         finite(limits.lateral_error_mm),
         finite(limits.acceleration_mm_s2, period_s),
         finite(limits.yaw_acceleration_rad_s2, period_s),
         finite(limits.lateral_acceleration_mm_s2),
+        turning_loss * period_s,
+        finite(limits.reverse_mm_s),
         1.0 if limits.cancel_slip else 0.0,
     )
 
@@ -79,17 +87,20 @@ def limited_twist(
 ) -> tuple[float, float]:
     """Twist for the wheels (mm/s, rad/s) if the body shall have ``u``.
 
-    ``last`` is the wheels' twist of the step before, ``delta`` the estimated slip, ``cruise`` the
+    In a turn the motors have less left to accelerate with: the limit on it falls with the square of
+    |u₁ u₂|. ``last`` is the wheels' twist of the step before, ``delta`` the estimated slip, ``cruise`` the
     reference's speed (mm/s). Where speed and yaw rate together are too much, what is beyond the
     reference's speed gives way first, and then the yaw rate.
     """
     s_1, s_2 = limits.slip * delta_1, limits.slip * delta_2
-    b_1 = within(u_1, last_1 + s_1, limits.step_1)
     b_2 = within(u_2, last_2 + s_2, limits.step_2)
+    used = min(abs((last_1 + s_1) * (last_2 + s_2)) / limits.lateral, 1.0)
+    step_1 = limits.step_1 - limits.turning_loss * used * used
+    b_1 = within(u_1, last_1 + s_1, step_1)
     if abs(b_1 * b_2) > limits.lateral:
         enough = max(limits.lateral / abs(b_2), abs(cruise))
         if abs(b_1) > enough:
-            b_1 = within(math.copysign(enough, b_1), last_1 + s_1, limits.step_1)
+            b_1 = within(math.copysign(enough, b_1), last_1 + s_1, step_1)
     if abs(b_1 * b_2) > limits.lateral:
         b_2 = math.copysign(limits.lateral / abs(b_1), b_2)
     return b_1 - s_1, b_2 - s_2

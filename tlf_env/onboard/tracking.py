@@ -8,6 +8,7 @@ from typing import NamedTuple
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.trig import sincos
 from tlf_env.onboard.limiter import Limits, TwistLimits, limits_row
+from tlf_env.onboard.spacing import Spacing, SpacingRow, spacing_row
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
 HEADING_DAMPING_PER_S = 0.83
@@ -46,6 +47,7 @@ class Controller(Frozen):
 
     gains: TrackingGains = TrackingGains()
     limits: TwistLimits = TwistLimits()
+    spacing: Spacing | None = None  # the distance kept from the predecessor, if any
     lead_s: NonNegative = 0.0
 
 
@@ -54,6 +56,7 @@ class ControllerRow(NamedTuple):
 
     gains: Gains
     limits: Limits
+    spacing: SpacingRow
     lead: float  # as a fraction of the time to the first preview
 
 
@@ -74,11 +77,14 @@ CONTROLLERS: dict[str, Controller] = {
         limits=TwistLimits(
             forward_error_mm=440.0,
             lateral_error_mm=150.0,
-            acceleration_mm_s2=153.0,
+            acceleration_mm_s2=165.0,
+            turning_acceleration_mm_s2=140.0,
             yaw_acceleration_rad_s2=8.2,
-            lateral_acceleration_mm_s2=177.0,
+            lateral_acceleration_mm_s2=150.0,
+            reverse_mm_s=20.0,
             cancel_slip=True,
         ),
+        spacing=Spacing(),
         lead_s=0.015,
     ),
 }
@@ -125,7 +131,12 @@ def controller_row(
             f"lead_s {known.lead_s} needs a first preview above 0, got preview_s {preview_s}"
         )
     lead = known.lead_s / preview_s[0] if known.lead_s else 0.0
-    return ControllerRow(gains_row(known.gains), limits_row(known.limits, period_s), lead)
+    return ControllerRow(
+        gains_row(known.gains),
+        limits_row(known.limits, period_s),
+        spacing_row(known.spacing),
+        lead,
+    )
 
 
 def gains_row(gains: TrackingGains) -> Gains:

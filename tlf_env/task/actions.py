@@ -8,6 +8,7 @@ import numpy as np
 
 from tlf_env.numerics.compiled import law
 from tlf_env.onboard.limiter import limited_twist, saturated
+from tlf_env.onboard.spacing import Heard, spaced_twist
 from tlf_env.onboard.tracking import ControllerRow, tracking_twist
 from tlf_env.physics.parameters import Body
 from tlf_env.task.observation import Entry, Preview, Tracking
@@ -65,6 +66,8 @@ LATER_U_1 = len(Tracking._fields) + Preview._fields.index("u_1")
 LATER_U_2 = len(Tracking._fields) + Preview._fields.index("u_2")
 SLIP_1 = Tracking._fields.index("slip_1")
 SLIP_2 = Tracking._fields.index("slip_2")
+IS_LEADER = Tracking._fields.index("is_leader")
+PREDECESSOR = Tracking._fields.index("predecessor_forward")
 
 
 @law
@@ -94,10 +97,27 @@ def wanted_twist(
 
 
 @law
+def heard_predecessor(observation: np.ndarray, scales: np.ndarray) -> Heard:
+    """The predecessor as one ``tracking`` observation tells of it."""
+    i = PREDECESSOR
+    return Heard(
+        observation[i] * scales[i],
+        observation[i + 1] * scales[i + 1],
+        observation[i + 2] * scales[i + 2],
+        observation[i + 3] * scales[i + 3],
+        observation[i + 4] * scales[i + 4],
+        observation[i + 5] * scales[i + 5],
+    )
+
+
+@law
 def twist_action(
     observation: np.ndarray, scales: np.ndarray, row: ControllerRow, u_1: float, u_2: float
 ) -> tuple[float, float]:
     """The ``twist`` action that asks the wheels for a twist (mm/s, rad/s), within the limits."""
+    u_1 = max(u_1, -row.limits.reverse)
+    if row.spacing.distance > 0.0 and observation[IS_LEADER] * scales[IS_LEADER] < 0.5:
+        u_1, u_2 = spaced_twist(u_1, u_2, heard_predecessor(observation, scales), row.spacing)
     v_1, v_2 = limited_twist(
         u_1,
         u_2,

@@ -25,8 +25,8 @@ from tlf_env.task.arrays import (
     read_trace,
 )
 from tlf_env.task.measures import distance, time_gap_error
-from tlf_env.task.observation import SensorTail, Tracking, preview_entries, scaled
-from tlf_env.task.radio import DELTA_1, DELTA_2, delayed_message, read_reference
+from tlf_env.task.observation import Preview, SensorTail, Tracking, preview_entries, scaled
+from tlf_env.task.radio import DELTA_1, DELTA_2, delayed_message, latest_message, read_reference
 from tlf_env.task.reward import reward_terms
 from tlf_env.task.settings import Settings
 
@@ -50,6 +50,10 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
     if a.kinds[r, lane] != TORQUE:
         body = read_body(a.bodies, r, lane)
         command_1, command_2 = odometry(a.wanted[0, r, lane], a.wanted[1, r, lane], body.R, body.h)
+    before = Preview(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    if r > 0:
+        heard = latest_message(a, lane, r, step, s)
+        before = preview_entries(heard, estimate.x, estimate.y, estimate.theta)
     row = Tracking(
         e_1,
         e_2,
@@ -74,6 +78,12 @@ def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
         trace.torque_r * to_Nmm,
         1.0 if r == 0 else 0.0,
         1.0 if r == robots - 1 else 0.0,
+        before.forward,
+        before.right,
+        before.sin_turn,
+        before.cos_turn,
+        before.u_1,
+        before.u_2,
     )
     entries = len(row)
     for i in range(entries):

@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
-from tlf_env.onboard.observer import Reference
+from tlf_env.onboard.observer import Message, Reference
 from tlf_env.onboard.tracking import body_errors
 
 OBSERVATION_LIMIT = 10.0
@@ -47,6 +47,12 @@ class Tracking(NamedTuple):
     torque_r: float
     is_leader: float
     is_last: float
+    predecessor_forward: float
+    predecessor_right: float
+    predecessor_sin_turn: float
+    predecessor_cos_turn: float
+    predecessor_u_1: float
+    predecessor_u_2: float
 
 
 TRACKING_ENTRIES = {
@@ -73,6 +79,17 @@ TRACKING_ENTRIES = {
     "torque_r": Entry("torque of the right wheel, mean over the last step", "N·mm", 15.0),
     "is_leader": Entry("1 for the leader (robot_0)", "1", 1.0),
     "is_last": Entry("1 for the last robot of the formation", "1", 1.0),
+    "predecessor_forward": Entry(
+        "place of the predecessor as last heard, forward of the estimated pose; this and the five that "
+        "follow are 0 for the leader",
+        "mm",
+        500.0,
+    ),
+    "predecessor_right": Entry("its place, to the right of the estimated pose", "mm", 500.0),
+    "predecessor_sin_turn": Entry("sine of its heading minus the estimated heading", "1", 1.0),
+    "predecessor_cos_turn": Entry("cosine of its heading minus the estimated heading", "1", 1.0),
+    "predecessor_u_1": Entry("its speed as last heard", "mm/s", 500.0),
+    "predecessor_u_2": Entry("its yaw rate as last heard", "rad/s", 2.0),
 }
 
 
@@ -114,8 +131,8 @@ def scaled(value: float, scale: float) -> float:
 
 
 @law
-def preview_entries(later: Reference, x: float, y: float, theta: float) -> Preview:
-    """A later reference as seen from an estimated pose."""
+def preview_entries(later: Reference | Message, x: float, y: float, theta: float) -> Preview:
+    """A later reference, or another robot as heard, as seen from an estimated pose."""
     forward, right = body_errors(later.x - x, later.y - y, theta)
     turn = wrap(later.theta - theta)
     return Preview(forward, right, math.sin(turn), math.cos(turn), later.u_1, later.u_2)

@@ -57,6 +57,27 @@ def broadcast(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
 
 
 @law
+def lateness(a: Arrays, lane: int, r: int, step: int, s: Settings) -> tuple[int, int]:
+    """Control periods by which jitter makes messages older: of one gap ago, and of now."""
+    jitter = a.applied[JITTER, r, lane]
+    if not jitter > 0.0:
+        return 0, 0
+    before, now, _, _ = words(a.seeds[lane], RADIO_JITTER, r, a.clock[lane, 2], step)
+    ages = math.floor(jitter / s.period + 1e-9) + 1.0
+    return int(unit(before) * ages), int(unit(now) * ages)
+
+
+@law
+def heard_message(a: Arrays, lane: int, r: int, step: int, late: int, s: Settings) -> Message:
+    """The predecessor at a control step, by dead reckoning from a message ``late`` periods older."""
+    old = max(step - late, 0)
+    message = read_message(a.messages, old % a.messages.shape[1], r - 1, lane)
+    if late > 0:
+        message = dead_reckoned(message, min(late, max(step, 0)) * s.period)
+    return message
+
+
+@law
 def delayed_message(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
     """What robot ``r`` knows at a control step of its predecessor one gap before.
 
@@ -64,16 +85,15 @@ def delayed_message(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Mes
     within it; messages carry their time, so the rest is dead reckoning. Before the first gap has
     passed it is the predecessor's start, at rest.
     """
-    late = 0
-    jitter = a.applied[JITTER, r, lane]
-    if jitter > 0.0:
-        word, _, _, _ = words(a.seeds[lane], RADIO_JITTER, r, a.clock[lane, 2], step)
-        late = int(unit(word) * (math.floor(jitter / s.period + 1e-9) + 1.0))
-    old = max(step - s.gap - late, 0)
-    message = read_message(a.messages, old % a.messages.shape[1], r - 1, lane)
-    if late > 0:
-        message = dead_reckoned(message, min(late, max(step - s.gap, 0)) * s.period)
-    return message
+    late, _ = lateness(a, lane, r, step, s)
+    return heard_message(a, lane, r, step - s.gap, late, s)
+
+
+@law
+def latest_message(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
+    """What robot ``r`` knows at a control step of its predecessor now; jitter as above."""
+    _, late = lateness(a, lane, r, step, s)
+    return heard_message(a, lane, r, step, late, s)
 
 
 @law
