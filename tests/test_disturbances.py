@@ -799,7 +799,7 @@ def test_start_outlines_never_overlap_though_unchecked_draws_would():
 def test_a_scatter_without_room_is_refused_and_given_poses_are_taken_as_they_are():
     formation = make()
     with pytest.raises(ValueError, match=r"robot_1: no start pose without overlap"):
-        make({"start": {"heading_std_rad": 1e-15}}, start_spacing_mm=245.0)
+        make({"start": {"heading_std_rad": 1e-15}}, start_spacing_mm=221.0)
     poses = formation.arrays.starts[:, :, 0].T + np.array([10.0, 20.0, 0.1])
     formation = make("start")
     formation.reset(0, poses=poses)
@@ -974,6 +974,14 @@ PRESETS = {
     "combined-hard": combined(1),
     "combined-medium": combined(1 / 2),
     "combined-easy": combined(1 / 4),
+    "swell": {
+        "slip.delta_1_mm_s": {"type": "sine", "amplitude": 40, "frequency_hz": 0.12},
+        "slip.delta_2_rad_s": {
+            "type": "ornstein_uhlenbeck",
+            "std": 0.15,
+            "time_constant_s": 1.5,
+        },
+    },
 }
 
 

@@ -127,6 +127,7 @@ def test_the_reference_has_the_scenarios_period():
     fastest = controller("tuned").limits.acceleration_mm_s2
     seen = np.zeros(len(tracking_entries((1.0,))), dtype=np.float64)
     seen[:4] = 1.0, 0.0, 0.0, 1.0  # the reference is far ahead
+    seen[list(tracking_entries(())).index("is_leader")] = 1.0  # nobody is in the way
     for period_s in (0.01, 0.02):
         scenario = load_scenario(control_period_s=period_s, preview_s=(1.0,), estimator="ekf-slip")
         action, _ = make_policy("reference:tuned", scenario).predict(seen)

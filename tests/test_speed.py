@@ -71,7 +71,7 @@ def test_formations_are_put_where_the_recorded_ones_stood(moments):
     moments.spread(plant)
     assert plant.step_counts.tolist() == np.repeat([1000, 1100, 1200], count).tolist()
     assert np.array_equal(plant.seeds, np.tile(moments.lanes, 3))
-    assert plant.infos[:, :, 0].max() < 20.0  # position error
+    assert plant.infos[:, :, 0].max() < 50.0  # position error; the last robot has just arrived
 
 
 def test_recorded_actions_go_on_where_the_reference_went(moments):
