@@ -389,6 +389,16 @@ def test_an_entry_of_another_name_or_scale_is_told(tmp_path):
         make_policy(str(path), TWIST)
 
 
+def test_where_its_residual_counts_goes_with_a_policy(tmp_path):
+    fading = load_scenario(RESIDUAL, residual_fade_mm=4.0, residual_reach_mm=90.0)
+    path = str(written(tmp_path, scenario=fading))
+    _, scenario, overrides = enter(path, TWIST)
+    assert (scenario.residual_fade_mm, scenario.residual_reach_mm) == (4.0, 90.0)
+    assert overrides["residual_reach_mm"] == 90.0
+    with pytest.raises(ValueError, match=r"residual_fade_mm 4.0, the scenario has 5.0"):
+        make_policy(path, load_scenario(fading, residual_fade_mm=5.0))
+
+
 def test_what_a_policy_asks_for_is_given_where_nobody_set_it(tmp_path):
     path = str(written(tmp_path, scenario=RESIDUAL))
     policy, scenario, overrides = enter(path, TWIST)
