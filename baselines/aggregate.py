@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from arch.bootstrap import IIDBootstrap, IndependentSamplesBootstrap
-from scipy.stats import binomtest, trim_mean
+from scipy.stats import binomtest
 
 from baselines.bench import Results
 from baselines.policies import overrides_told, policy_names
@@ -38,8 +38,10 @@ Stratum = tuple[str, str, float | None]  # task, disturbance, value of the swept
 
 
 def interquartile_mean(values: np.ndarray) -> float:
-    """Mean of the middle half."""
-    return float(trim_mean(np.ravel(values), 0.25))
+    """Mean of the middle half: SciPy's ``trim_mean(values, 0.25)``, which takes many times as long."""
+    ordered = np.sort(values, axis=None)
+    cut = len(ordered) // 4
+    return float(ordered[cut : len(ordered) - cut].mean())
 
 
 def interval(values: np.ndarray, statistic: Callable[..., Any]) -> list[float] | None:
