@@ -12,7 +12,13 @@ from pydantic import ValidationError
 
 import tlf_env
 from baselines import ReferencePolicy
-from tlf_env.task.scenario import Scenario, load_scenario, preset_names, presets_folder
+from tlf_env.task.scenario import (
+    Scenario,
+    load_scenario,
+    preset_names,
+    presets_folder,
+    scenario_warnings,
+)
 
 NAN, INF = math.nan, math.inf
 
@@ -369,3 +375,12 @@ def test_periods_divide_in_spite_of_rounding():
         "infinity", control_period_s=0.006, time_gap_s=0.06, preview_s=(0.006,), horizon_s=0.3
     )
     assert (scenario.substeps, scenario.gap_steps, scenario.horizon_steps) == (6, 10, 50)
+
+
+def test_a_base_that_needs_a_slip_estimate_says_so():
+    needs = load_scenario("infinity", action="residual", residual_base="tuned")
+    assert any("estimates none" in line for line in scenario_warnings(needs))
+    for fields in ({"estimator": "ekf-slip"}, {"residual_base": "consistent"}):
+        assert not any(
+            "estimates none" in one for one in scenario_warnings(load_scenario(needs, **fields))
+        )

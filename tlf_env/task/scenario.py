@@ -374,7 +374,7 @@ def _warnings_for(*what: Any) -> tuple[str, ...]:
 
 
 def scenario_warnings(scenario: Scenario) -> list[str]:
-    """What the scenario's reference asks that its robots cannot do, a line each."""
+    """What of the scenario its robots cannot do, a line each."""
     lines = [
         line
         for robot in dict.fromkeys(scenario.robot_models)
@@ -387,6 +387,11 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             scenario.start_spacing_mm,
         )
     ]
+    if scenario.estimator == "ekf" and controller(scenario.residual_base).limits.cancel_slip:
+        lines.append(
+            f"residual_base {scenario.residual_base!r} takes the estimated slip off its commands, and "
+            "estimator 'ekf' estimates none; it is made for 'ekf-slip'"
+        )
     return list(dict.fromkeys(lines))
 
 
