@@ -1,6 +1,6 @@
 """Training on the batch plant: one policy for all robots, judged on seeds held apart, resumable.
 
-    tlf train configs/train/residual.yaml --seeds 0,1,2
+    tlf train residual --seeds 0,1,2
 
 One call of :func:`train` is one seed: environments and a model are made, the formations are spread over
 their episodes, and then rollouts and updates alternate. Every so often the policy is judged on choosing

@@ -10,7 +10,13 @@ from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
 from tlf_env.numerics.errors import one_line
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive
-from tlf_env.task.scenario import Scenario, load_scenario, read_yaml
+from tlf_env.task.scenario import (
+    Scenario,
+    load_scenario,
+    preset_names,
+    presets_folder,
+    read_yaml,
+)
 
 # Seeds of the benchmark's tables start at 20000: neither training nor choosing may see them.
 TRAINING_SEEDS = (0, 10_000)
@@ -131,14 +137,24 @@ def check_seeds(what: str, seeds: Seeds, allowed: Seeds, use: str) -> None:
 
 
 def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> TrainConfig:
-    """A training from a YAML file or a mapping; keywords override its fields.
+    """A training from a preset's name, a YAML file or a mapping; keywords override its fields.
 
     Raises
     ------
     ValueError
         in one line that names the value and what is allowed.
     """
-    data = dict(source) if isinstance(source, Mapping) else read_yaml(Path(source))
+    if isinstance(source, Mapping):
+        data = dict(source)
+    else:
+        folder = presets_folder() / "train"
+        names = preset_names(folder)
+        path = folder / f"{source}.yaml" if str(source) in names else Path(source)
+        if path.suffix not in (".yaml", ".yml"):
+            raise ValueError(
+                f"training {str(source)!r} is neither {', '.join(names)} nor a .yaml file"
+            )
+        data = read_yaml(path)
     data |= {name: value for name, value in overrides.items() if value is not None}
     try:
         return TrainConfig.model_validate(data)

@@ -86,6 +86,12 @@ def test_a_wrong_config_is_told_in_one_line(changes: dict, said: str):
     assert "\n" not in str(error.value)
 
 
+def test_presets_have_names():
+    assert load_config("quick") == load_config(presets_folder() / "train" / "quick.yaml")
+    with pytest.raises(ValueError, match="training 'quickly' is neither direct, quick"):
+        load_config("quickly")
+
+
 def command(tmp_path: Path, *words: str, **changes: object) -> list[str]:
     path = tmp_path / "small.yaml"
     path.write_text(yaml.safe_dump({**CONFIG, **changes}))

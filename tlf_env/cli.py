@@ -411,7 +411,10 @@ def bench(
 
 @app.command()
 def train(
-    config: Annotated[Path, typer.Argument(help="YAML file, as in configs/train.")],
+    config: Annotated[
+        str,
+        typer.Argument(help="A training: residual, direct, quick, sac, recurrent, or a YAML file."),
+    ],
     seeds: Annotated[str, typer.Option(help="Training seeds, parted by commas.")] = "0",
     robot_steps: Annotated[
         int | None, typer.Option(help="Control steps times robots, instead of the file's.")
@@ -438,9 +441,10 @@ def train(
         raise ValueError(f"training needs {error.name} (pip install 'tlf-env[train]')") from error
     loaded = load_config(config, robot_steps=robot_steps)
     numbers = whole_numbers("seeds", seeds)
-    folder = writable_folder(out or Path("results/train") / config.stem)
+    name = Path(config).stem
+    folder = writable_folder(out or Path("results/train") / name)
     warn_of_compiling()
-    with progress_bar(f"train {config.stem}") as update:
+    with progress_bar(f"train {name}") as update:
         curves = train_seeds(
             loaded,
             numbers,

@@ -1,6 +1,6 @@
 """Put trainings into ``docs/learning.md``: their table, learning curves, and the curves' numbers.
 
-``tlf train configs/train/NAME.yaml --seeds 0,1,2`` trains; then call this as
+``tlf train NAME --seeds 0,1,2`` trains; then call this as
 ``python docs/figures/make_learning.py results/train/residual results/train/direct``. It needs the extra
 ``figures``. What ran is kept in ``docs/learning/``, from which a call without folders draws again.
 """
