@@ -29,6 +29,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 from baselines.checkpoint import read_checkpoint, write_checkpoint
 from baselines.evaluate import evaluate, overall_mm
 from baselines.export import export_policy
+from baselines.imitation import imitate
 from baselines.jobs import alone_in, claim
 from baselines.run import versions
 from baselines.sb3 import FormationVecEnv
@@ -116,6 +117,8 @@ def _train(
     else:
         done = Progress()
         spread_out(model, envs, config.seeds[0])
+        if config.imitation is not None:
+            imitate(model, envs, config)
         judge(model, config, seed, folder, done, command)
     began = time.perf_counter() - done.wall_time_s
     with interrupts() as stop:

@@ -36,6 +36,16 @@ class NetworkConfig(Frozen):
     action_gain: Positive = 0.1  # factor on the first weights of the action: begin near 0
 
 
+class ImitationConfig(Frozen):
+    """Doing first what another policy does; PPO only."""
+
+    policy: str  # as for `tlf run --policy`, with the same observation and action
+    robot_steps: Count = 600_000  # that it drives to be imitated
+    noise: NonNegative = 0.02  # on its actions, standard deviation
+    epochs: Count = 10
+    learning_rate: Positive = 1e-3
+
+
 class EvaluationConfig(Frozen):
     """Judging on seeds held apart: which of the policies on the way is kept."""
 
@@ -57,6 +67,7 @@ class TrainConfig(Frozen):
     settings: dict[str, Any] = {}  # the algorithm's own keyword arguments, in its own names
     final_learning_rate_share: Annotated[FiniteFloat, Field(gt=0, le=1)] = 1.0  # falls linearly
     network: NetworkConfig = NetworkConfig()
+    imitation: ImitationConfig | None = None
     robot_steps: Count  # control steps times robots, over all formations
     formations: Count = 96
     seeds: Seeds = TRAINING_SEEDS  # of the episodes
@@ -77,6 +88,8 @@ class TrainConfig(Frozen):
                 f"network.lstm is for RecurrentPPO and needed there; got {self.network.lstm} "
                 f"with {self.algorithm}"
             )
+        if self.imitation is not None and self.algorithm != "PPO":
+            raise ValueError(f"imitation is for PPO, not for {self.algorithm}")
         if not any(self.disturbances.values()):
             raise ValueError("disturbances: at least one share must be above 0")
         for reserved in ("seed", "policy", "env", "policy_kwargs", "tensorboard_log", "use_sde"):

@@ -1,0 +1,86 @@
+"""A start for policies that act by themselves: do first what another policy does."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import torch
+
+from baselines.policies import make_policy
+from baselines.sb3 import FormationVecEnv
+from baselines.train_config import TrainConfig
+
+BATCH = 2048
+
+
+def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
+    """Fit a model of PPO to the policy named in ``config.imitation``, and its critic to what that earns.
+
+    The teacher drives all formations, disturbed a little so that its way back is seen too; the network
+    is fitted to what the teacher would have done, and the critic to the discounted rewards that followed.
+
+    Raises
+    ------
+    ValueError
+        if the teacher does not fit the scenario.
+    """
+    wanted = config.imitation
+    assert wanted is not None
+    teacher = make_policy(wanted.policy, envs.plants[0].scenario)
+    steps = -(-wanted.robot_steps // envs.num_envs)
+    shape = (steps, envs.num_envs)
+    seen = np.empty((*shape, *model.observation_space.shape), dtype=np.float32)
+    meant = np.empty((*shape, *model.action_space.shape), dtype=np.float32)
+    rewards, dones = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.bool_)
+    generator = np.random.default_rng(model.seed)
+    observations = envs.observations()
+    for k in range(steps):
+        seen[k] = observations
+        meant[k], _ = teacher.predict(observations)
+        given = meant[k] + wanted.noise * generator.standard_normal(meant[k].shape)
+        observations, rewards[k], dones[k], _ = envs.step(np.clip(given, -1.0, 1.0))
+    returns = np.empty_like(rewards)
+    last = rewards[-steps // 4 :].mean() / (1.0 - model.gamma)  # as if it went on like that
+    following = np.full(envs.num_envs, last, dtype=np.float32)
+    for k in reversed(range(steps)):
+        following = rewards[k] + model.gamma * np.where(dones[k], 0.0, following)
+        returns[k] = following
+    rows = steps * envs.num_envs
+    _fit(
+        model,
+        torch.from_numpy(seen.reshape(rows, -1)),
+        torch.from_numpy(meant.reshape(rows, -1)),
+        torch.from_numpy(returns.ravel()),
+        wanted.epochs,
+        wanted.learning_rate,
+    )
+    model._last_obs = observations
+    model._last_episode_starts = np.asarray(dones[-1])
+
+
+def _fit(
+    model: Any,
+    seen: torch.Tensor,
+    meant: torch.Tensor,
+    returns: torch.Tensor,
+    epochs: int,
+    rate: float,
+) -> None:
+    policy = model.policy
+    kept = [parameter for name, parameter in policy.named_parameters() if name != "log_std"]
+    optimizer = torch.optim.Adam(kept, lr=rate)
+    spread = meant.std(dim=0) + 1e-6
+    scale = returns.std() + 1e-6
+    batches = -(-len(seen) // BATCH)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * batches)
+    for _ in range(epochs):
+        for rows in torch.randperm(len(seen)).split(BATCH):
+            mean = policy.get_distribution(seen[rows]).distribution.mean
+            value = policy.predict_values(seen[rows]).flatten()
+            loss = torch.square((mean - meant[rows]) / spread).mean()
+            loss = loss + torch.square((value - returns[rows]) / scale).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()
