@@ -33,7 +33,7 @@ def test_without_bounds_everything_counts(e_1: float, e_2: float):
 @given(st.floats(1e-3, 2000), st.floats(0.1, 50), st.floats(60, 1000), st.floats(0, 6.3))
 def test_it_is_a_share_and_halves_at_its_bounds(e: float, fade: float, reach: float, turn: float):
     found = share(e * math.cos(turn), e * math.sin(turn), fade, reach)
-    expected = e**4 / (e**4 + fade**4) * reach**4 / (e**4 + reach**4)
+    expected = e / (e + fade) * reach**4 / (e**4 + reach**4)
     assert found == pytest.approx(expected, rel=1e-6, abs=1e-12)
     assert 0.0 <= found <= 1.0
     assert share(fade, 0.0, fade, math.inf) == pytest.approx(0.5)

@@ -142,20 +142,20 @@ def reference_action(
 
 @law
 def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float, reach: float) -> float:
-    """How much of a residual counts at the estimated error e: e⁴/(e⁴ + fade⁴) · reach⁴/(e⁴ + reach⁴); mm.
+    """How much of a residual counts at the estimated error e: e/(e + fade) · reach⁴/(e⁴ + reach⁴); mm.
 
-    Near its reference and far from it a robot is driven by the base alone: near, that is quieter than
-    what has learned to correct errors, and far, it is known to come back. Everything counts if
-    ``fade`` is 0 and ``reach`` infinite.
+    Near its reference and far from it a robot is driven by the base alone. Near, a residual is no more
+    than a change of gain, and a small bias in it leaves no error behind; far, the base is known to come
+    back. Everything counts if ``fade`` is 0 and ``reach`` infinite.
     """
     if fade == 0.0 and reach == math.inf:
         return 1.0
     e_1, e_2 = observation[E_1] * scales[E_1], observation[E_2] * scales[E_2]
     squared = e_1 * e_1 + e_2 * e_2
-    if squared == 0.0:
-        return 1.0 if fade == 0.0 else 0.0
-    near, far = fade * fade / squared, squared / (reach * reach)
-    return 1.0 / ((1.0 + near * near) * (1.0 + far * far))
+    error = math.sqrt(squared)
+    near = 1.0 if fade == 0.0 else error / (error + fade)
+    far = squared / (reach * reach)
+    return near / (1.0 + far * far)
 
 
 @law
