@@ -1,4 +1,4 @@
-"""A start for policies that act by themselves: do first what another policy does."""
+"""A start for policies that act by themselves: do first what the reference does."""
 
 from __future__ import annotations
 
@@ -7,27 +7,39 @@ from typing import Any
 import numpy as np
 import torch
 
-from baselines.policies import make_policy
+from baselines.policies import fits
+from baselines.reference import ReferencePolicy
 from baselines.sb3 import FormationVecEnv
 from baselines.train_config import TrainConfig
+from tlf_env.onboard.tracking import controller
 
 BATCH = 2048
 
 
 def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
-    """Fit a model of PPO to the policy named in ``config.imitation``, and its critic to what that earns.
+    """Fit a model of PPO to the reference that ``config.imitation`` names, and its critic to what that earns.
 
     The teacher drives all formations, disturbed a little so that its way back is seen too; the network
     is fitted to what the teacher would have done, and the critic to the discounted rewards that followed.
+    Limits on accelerations are taken off the teacher: with them its command is the last one and a small
+    step, and a network that imitates this drifts away.
 
     Raises
     ------
     ValueError
-        if the teacher does not fit the scenario.
+        if the reference does not fit the scenario.
     """
     wanted = config.imitation
     assert wanted is not None
-    teacher = make_policy(wanted.policy, envs.plants[0].scenario)
+    scenario = envs.plants[0].scenario
+    fits("the teacher", scenario, action="twist", observation="tracking")
+    known = controller(wanted.controller)
+    free = known.limits.model_copy(
+        update={"acceleration_mm_s2": None, "yaw_acceleration_rad_s2": None}
+    )
+    teacher = ReferencePolicy(
+        known.model_copy(update={"limits": free}), scenario.control_period_s, scenario.preview_s
+    )
     steps = -(-wanted.robot_steps // envs.num_envs)
     shape = (steps, envs.num_envs)
     seen = np.empty((*shape, *model.observation_space.shape), dtype=np.float32)

@@ -37,9 +37,9 @@ class NetworkConfig(Frozen):
 
 
 class ImitationConfig(Frozen):
-    """Doing first what another policy does; PPO only."""
+    """Doing first what the reference does; PPO with twists from ``tracking`` only."""
 
-    policy: str  # as for `tlf run --policy`, with the same observation and action
+    controller: str = "tuned"  # gains of the reference, without its limits on accelerations
     robot_steps: Count = 600_000  # that it drives to be imitated
     noise: NonNegative = 0.02  # on its actions, standard deviation
     epochs: Count = 10

@@ -75,12 +75,12 @@ CONTROLLERS: dict[str, Controller] = {
             k_1_per_s=0.55, k_2_mm2_s=6.4 * 1.76e4, k_3_mm2=1.76e4, eta=1e-4, epsilon=0.05
         ),
         limits=TwistLimits(
-            forward_error_mm=440.0,
+            forward_error_mm=300.0,
             lateral_error_mm=150.0,
-            acceleration_mm_s2=165.0,
-            turning_acceleration_mm_s2=140.0,
-            yaw_acceleration_rad_s2=8.2,
-            lateral_acceleration_mm_s2=150.0,
+            acceleration_mm_s2=185.0,
+            turning_acceleration_mm_s2=150.0,
+            yaw_acceleration_rad_s2=20.0,
+            lateral_acceleration_mm_s2=177.0,
             reverse_mm_s=20.0,
             cancel_slip=True,
         ),
