@@ -77,6 +77,7 @@ def test_shipped_configs_are_valid(path: Path):
         ({"network": {"lstm": 8}}, "network.lstm is for RecurrentPPO and needed there; got 8"),
         ({"algorithm": "RecurrentPPO"}, "network.lstm is for RecurrentPPO and needed there"),
         ({"settings": {"seed": 3}}, "settings.seed is set elsewhere"),
+        ({"algorithm": "SAC", "imitation": {}}, "imitation is for PPO, not for SAC"),
     ],
 )
 def test_a_wrong_config_is_told_in_one_line(changes: dict, said: str):
@@ -184,13 +185,39 @@ class TestTraining:
         for name, cell in kept(curve)["cells"].items():
             assert found[name].score_mm == pytest.approx(cell["score_mm"], rel=1e-3)
 
+    def test_imitation_brings_the_network_near_the_reference(self):
+        import numpy as np
+
+        from baselines import ReferencePolicy
+        from baselines.imitation import imitate
+        from baselines.train import make_envs, make_model, spread_out
+
+        fields = {**SHORT, "horizon_s": 10.0, "action": "twist", "estimator": "ekf-slip"}
+        config = load_config(
+            {
+                **CONFIG,
+                "scenario": fields,
+                "imitation": {"robot_steps": 20_000, "epochs": 40},
+                "network": {"hidden": [32, 32]},
+            }
+        )
+        envs = make_envs(config, 1)
+        model = make_model(config, envs, 0)
+        spread_out(model, envs, 0)
+        imitate(model, envs, config)
+        seen = envs.observations()
+        meant = ReferencePolicy("tuned", preview_s=(0.5,)).predict(seen)[0]
+        apart = np.abs(model.predict(seen, deterministic=True)[0] - meant).mean()
+        assert apart < 0.5 * np.abs(meant).mean()  # what an action of 0 is apart, halved
+        assert np.array_equal(model._last_obs, seen)
+
     def test_another_training_in_the_folder_is_refused(self, tmp_path):
         from baselines.train import train
 
         train(load_config(CONFIG), 0, tmp_path)
-        with pytest.raises(ValueError, match="holds a training with another seed"):
+        with pytest.raises(ValueError, match="holds a training of another seed"):
             train(load_config(CONFIG), 1, tmp_path)
-        with pytest.raises(ValueError, match="holds a training with another config"):
+        with pytest.raises(ValueError, match="holds a training of another config"):
             train(load_config(CONFIG, robot_steps=900), 0, tmp_path)
 
     @pytest.mark.parametrize("damage", ["cut", "text", "other"])

@@ -24,6 +24,7 @@ KEPT = DOCS / "learning"
 BEGIN, END = "<!-- trainings -->", "<!-- end of trainings -->"
 COLOURS = {"residual": BLUE, "direct": ORANGE}
 MILLION = 1e6
+TICKS_MM = (2, 3, 5, 10, 20, 50)
 
 Curve = dict[str, Any]
 
@@ -87,7 +88,8 @@ def draw(curves: dict[str, list[Curve]], path: Path) -> None:
         for name, seeds in curves.items():
             colour = COLOURS.get(name, GREEN)
             for i, curve in enumerate(seeds):
-                label = f"{name}, {len(seeds)} seeds" if i == 0 else None
+                count = "1 seed" if len(seeds) == 1 else f"{len(seeds)} seeds"
+                label = f"{name}, {count}" if i == 0 else None
                 rows = curve["evaluations"]
                 steps = [row["robot_steps"] / MILLION for row in rows]
                 left.plot(steps, [row["score_mm"] for row in rows], ".-", color=colour, label=label)
@@ -101,6 +103,8 @@ def draw(curves: dict[str, list[Curve]], path: Path) -> None:
             )
         left.set(xlabel="robot steps, millions", ylabel="score on choosing seeds, mm", yscale="log")
         right.set(xlabel="robot steps, millions", ylabel="mean reward of a robot and step")
+        left.set_yticks(TICKS_MM, [f"{tick:g}" for tick in TICKS_MM])
+        left.minorticks_off()
         left.legend()
         figure.savefig(path)
 
