@@ -32,7 +32,8 @@ def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, told: dict[s
         Anything that JSON has; :func:`read_checkpoint` gives it back.
     """
     tensors: dict[str, torch.Tensor] = {"torch_generator": torch.get_rng_state()}
-    kind, keys, place, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws from it
+    # SB3 shuffles its samples with NumPy's global generator, so that one has to be kept and put back.
+    kind, keys, place, has_gauss, gauss = np.random.get_state()  # noqa: NPY002
     tensors["numpy_generator"] = torch.from_numpy(np.asarray(keys).copy())
     plain = {
         "told": told,
@@ -62,7 +63,8 @@ def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, 
     """
     try:
         with safe_open(path, "pt") as file:
-            tensors = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118  no mapping
+            names = list(file.keys())  # what safetensors opens cannot be iterated itself
+            tensors = {name: file.get_tensor(name) for name in names}
             plain = json.loads(file.metadata()["state"])
         model.set_parameters(_with_tensors(plain["parameters"], tensors), exact_match=True)
         _remember(model, _with_tensors(plain["memory"], tensors))
@@ -72,7 +74,7 @@ def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, 
             plant._seeded[:] = True
         kind, *rest = plain["numpy_generator"]
         keys = tensors["numpy_generator"].numpy()
-        np.random.set_state((kind, keys, *rest))  # noqa: NPY002 - SB3 draws from it
+        np.random.set_state((kind, keys, *rest))  # noqa: NPY002 - as when it was written
         model.action_space.np_random.bit_generator.state = plain["action_generator"]
         torch.set_rng_state(tensors["torch_generator"])
     except (SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as error:

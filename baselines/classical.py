@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from tlf_env.task.observation import tracking_entries
 DEFAULT_PREVIEW_S = (0.5, 1.0)
 
 
-class _Memoryless:
+class _Memoryless(ABC):
     """SB3's ``predict`` around a law from named entries (physical units) to a twist."""
 
     privileged = False
@@ -22,9 +23,9 @@ class _Memoryless:
         self._places = {name: i for i, name in enumerate(entries)}
         self._scales = np.array([entry.scale for entry in entries.values()])
 
+    @abstractmethod
     def twist(self, seen: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """Forward speed (mm/s) and yaw rate (rad/s) for entries ``(batch,)`` by name."""
-        raise NotImplementedError
 
     def predict(
         self,

@@ -71,7 +71,11 @@ def test_formations_are_put_where_the_recorded_ones_stood(moments):
     moments.spread(plant)
     assert plant.step_counts.tolist() == np.repeat([1000, 1100, 1200], count).tolist()
     assert np.array_equal(plant.seeds, np.tile(moments.lanes, 3))
-    assert plant.infos[:, :, 0].max() < 50.0  # position error; the last robot has just arrived
+    for number, infos in enumerate(np.split(plant.infos, 3)):
+        recorded = moments.arrays[number]
+        assert np.array_equal(infos, recorded.infos[moments.lanes])
+        here = plant.arrays.motions[:, :, number * count : (number + 1) * count]
+        assert np.array_equal(here, recorded.motions[:, :, moments.lanes])
 
 
 def test_recorded_actions_go_on_where_the_reference_went(moments):
