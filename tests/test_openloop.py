@@ -14,6 +14,8 @@ from pydantic import ValidationError
 import tlf_env
 from tlf_env.physics.openloop import (
     COLUMNS,
+    MAX_MM,
+    MAX_RAD,
     OpenLoopScenario,
     OpenLoopStart,
     initial_rows,
@@ -89,6 +91,12 @@ def test_a_name_that_cannot_name_a_file_is_refused(tmp_path, name):
         ({"duration_s": "long"}, "go.duration_s", "'long'"),
         ({"duration_s": None}, "go.duration_s", "None"),
         ({"start": {"yaw_rad_s": math.inf}}, "go.start.yaw_rad_s", "inf"),
+        ({"start": {"yaw_rad_s": 1e200}}, "go.start.yaw_rad_s", "1e+200"),
+        ({"start": {"castor_rad": -1e300}}, "go.start.castor_rad", "-1e+300"),
+        ({"start": {"forward_mm_s": 1e10}}, "go.start.forward_mm_s", "10000000000.0"),
+        ({"duration_s": 1e-9}, "duration_s", "1e-09"),
+        ({"duration_s": 0.05}, "duration_s", "0.05"),
+        ({"inputs": [{**PUSH_OFF, "from_s": 1e308}]}, "go.inputs.0.from_s", "1e+308"),
         ({"start": 7}, "go.start", "7"),
         ({"joint_friction": "perhaps"}, "go.joint_friction", "'perhaps'"),
         ({"inputs": []}, "go.inputs", "at least 1"),
@@ -102,6 +110,24 @@ def test_an_impossible_value_is_refused_by_name(tmp_path, changes, place, value)
     message = refused(tmp_path, {"go": {**RUN, **changes}})
     assert place in message
     assert value in message
+
+
+@pytest.mark.parametrize("sign", [-1, 1])
+@pytest.mark.parametrize(
+    "names", [[one] for one in OpenLoopStart.model_fields] + [list(OpenLoopStart.model_fields)]
+)
+def test_a_start_at_its_bounds_stays_finite(names, sign):
+    bounds = {name: sign * (MAX_RAD if "rad" in name else MAX_MM) for name in names}
+    assert np.isfinite(run_open_loop(scenario(start=bounds, duration_s=0.3))).all()
+
+
+@pytest.mark.parametrize(
+    "text", ['{"go": 1, "go": 2}', '{"go": {"duration_s": 1, "duration_s": 2}}']
+)
+def test_a_key_that_stands_twice_is_refused(tmp_path, text):
+    path = tmp_path / "runs.json"
+    path.write_text(text)
+    assert re.search("the key '(go|duration_s)' stands there twice", complaint(path))
 
 
 @pytest.mark.parametrize("missing", ["duration_s", "inputs"])

@@ -51,31 +51,36 @@ ROW_EVERY_S = 0.1
 MAX_DURATION_S = 1e5
 MAX_TORQUE_NMM = 1e6
 MAX_STEPS = 100_000_000
+# Far beyond any robot, and small enough that the plant's squares and products stay finite.
+MAX_MM = 1e9  # and mm/s
+MAX_RAD = 1e4  # and rad/s
 NAME = re.compile(r"[\w][\w.+-]{0,99}")
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Torque = Annotated[Number, Field(ge=-MAX_TORQUE_NMM, le=MAX_TORQUE_NMM)]
+Length = Annotated[Number, Field(ge=-MAX_MM, le=MAX_MM)]
+Angle = Annotated[Number, Field(ge=-MAX_RAD, le=MAX_RAD)]
 
 
 class OpenLoopStart(Frozen):
     """State of the axle's midpoint c, the castor and the wheels at t = 0."""
 
-    x_mm: Number = 0.0
-    y_mm: Number = 0.0
-    theta_rad: Number = 0.0
-    castor_rad: Number = 0.0
-    forward_mm_s: Number = 0.0
-    right_mm_s: Number = 0.0
-    yaw_rad_s: Number = 0.0
-    omega_l_rad_s: Number = 0.0
-    omega_r_rad_s: Number = 0.0
-    castor_spin_rad_s: Number = 0.0
+    x_mm: Length = 0.0
+    y_mm: Length = 0.0
+    theta_rad: Angle = 0.0
+    castor_rad: Angle = 0.0
+    forward_mm_s: Length = 0.0
+    right_mm_s: Length = 0.0
+    yaw_rad_s: Angle = 0.0
+    omega_l_rad_s: Angle = 0.0
+    omega_r_rad_s: Angle = 0.0
+    castor_spin_rad_s: Angle = 0.0
 
 
 class OpenLoopInput(Frozen):
     """Torques (N·mm) that hold from ``from_s`` on."""
 
-    from_s: Annotated[Number, Field(ge=0)] = 0.0
+    from_s: Annotated[Number, Field(ge=0, le=MAX_DURATION_S)] = 0.0
     torque_l_Nmm: Torque
     torque_r_Nmm: Torque
 
@@ -93,11 +98,11 @@ class OpenLoopScenario(Frozen):
         times = [one.from_s for one in self.inputs]
         if any(b <= a for a, b in itertools.pairwise(times)):
             raise ValueError(f"inputs: from_s must increase from one to the next, got {times}")
-        if not math.isclose(self.duration_s % ROW_EVERY_S, 0.0, abs_tol=1e-9) and not math.isclose(
-            self.duration_s % ROW_EVERY_S, ROW_EVERY_S, abs_tol=1e-9
-        ):
+        rows = round(self.duration_s / ROW_EVERY_S)
+        if rows < 1 or abs(rows * ROW_EVERY_S - self.duration_s) > 1e-9:
             raise ValueError(
-                f"duration_s {self.duration_s} must be a multiple of {ROW_EVERY_S} s, the rows' distance"
+                f"duration_s {self.duration_s} must be a multiple of {ROW_EVERY_S} s, the rows' "
+                "distance, and at least one"
             )
         return self
 
@@ -214,6 +219,20 @@ def run_open_loop(
     return np.array(rows)
 
 
+class _RepeatedKeyError(ValueError):
+    """A JSON object has a key twice."""
+
+
+def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
+    """A JSON object; the standard reader would keep the last of two equal keys in silence."""
+    found: dict[str, Any] = {}
+    for key, value in pairs:
+        if key in found:
+            raise _RepeatedKeyError(f"the key {key!r} stands there twice")
+        found[key] = value
+    return found
+
+
 def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
     """Read ``{name: scenario}`` from a JSON file.
 
@@ -223,9 +242,12 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
         in one line, if the file is missing, is not JSON, or holds an impossible scenario.
     """
     try:
-        data: Any = json.loads(path.read_text(encoding="utf-8"))
+        text = path.read_text(encoding="utf-8")
+        data: Any = json.loads(text, object_pairs_hook=_without_repeats)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
+    except _RepeatedKeyError as error:
+        raise ValueError(f"{path}: {error}") from error
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
     if not isinstance(data, dict) or not data:
