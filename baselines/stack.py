@@ -41,7 +41,8 @@ from tlf_env.onboard.wheel_loop import (
     wheel_torque,
     write_loop_state,
 )
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Body, body
+from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, body_array
+from tlf_env.physics.state import read_body
 from tlf_env.task.actions import (
     ACTION_SIZE,
     FULL_SPEED_MM_S,
@@ -68,7 +69,7 @@ class StackState(NamedTuple):
 class StackSettings(NamedTuple):
     """Constants of the stacks."""
 
-    body: Body
+    bodies: np.ndarray  # (field, robot, 1); one robot where all are alike
     ekf: Ekf
     loop: WheelLoop
     gains: Gains
@@ -84,6 +85,7 @@ def _torques(
     rows: np.ndarray, scales: np.ndarray, state: StackState, c: StackSettings, out: np.ndarray
 ) -> None:
     for r in range(rows.shape[0]):
+        body = read_body(c.bodies, r % c.bodies.shape[1], 0)
         values = rows[r] * scales
         first = SAMPLE * c.substeps
         tail = SensorTail(
@@ -119,7 +121,7 @@ def _torques(
             for k in range(c.substeps):
                 i = SAMPLE * k
                 step_l, step_r = values[i + 2], values[i + 3]
-                u_1, u_2 = odometry(step_l, step_r, c.body.R, c.body.h)
+                u_1, u_2 = odometry(step_l, step_r, body.R, body.h)
                 estimate = predict(estimate, c.ekf, u_1, u_2)
                 fix_x, fix_y = values[i] + tail.start_x, values[i + 1] + tail.start_y
                 estimate, _, _, _ = correct(estimate, c.ekf, fix_x, fix_y)
@@ -151,9 +153,9 @@ def _torques(
         )
         u_1 = min(max(u_1, -FULL_SPEED_MM_S), FULL_SPEED_MM_S)
         u_2 = min(max(u_2, -FULL_YAW_RATE_RAD_S), FULL_YAW_RATE_RAD_S)
-        wanted_l, wanted_r = wheel_speeds(u_1, u_2, c.body)
+        wanted_l, wanted_r = wheel_speeds(u_1, u_2, body)
         held = read_loop_state(state.loops, r, 0)
-        limit = c.body.torque_limit
+        limit = body.torque_limit
         torque_l, integral_l, lag_l = wheel_torque(
             wanted_l - state.speeds[0, r, 0], held.integral_l, held.lag_l, c.loop, limit
         )
@@ -168,10 +170,13 @@ def _torques(
 class StackPolicy:
     """EKF, observer, tracking law and wheel loop, each robot by itself; SB3's ``predict``, recurrent.
 
+    Where the scenario's robots are alike it drives any number of them; where they are not, row r of a
+    batch is robot r modulo their number, as the rows of several formations are.
+
     Parameters
     ----------
     scenario
-        The scenario that it will run on: periods and the stack's parameters are read from it.
+        The scenario that it will run on: periods, robots and the stack's parameters are read from it.
     gains
         A preset of the paper's law, ``"consistent"`` or ``"printed"``.
 
@@ -179,7 +184,9 @@ class StackPolicy:
     ------
     ValueError
         for other gains (the stack has neither limits nor an estimate of the slip), and if the
-        scenario names parts of its own.
+        scenario names parts of its own, has another estimator than ``ekf``, another observation than
+        ``sensor``, another action than ``torque``, or a control period of several physics periods
+        (on board the wheel loop runs in every one).
     """
 
     privileged = False
@@ -190,15 +197,28 @@ class StackPolicy:
             raise ValueError(
                 "StackPolicy has the paper's wheel loop and observer; the scenario names parts"
             )
+        for field, only in (("estimator", "ekf"), ("observation", "sensor"), ("action", "torque")):
+            if getattr(scenario, field) != only:
+                raise ValueError(
+                    f"StackPolicy needs {field} {only!r}; the scenario has {getattr(scenario, field)!r}"
+                )
+        if scenario.substeps != 1:
+            raise ValueError(
+                "StackPolicy gives the torques of every physics period: control_period_s "
+                f"{scenario.control_period_s} must be physics_period_s {scenario.physics_period_s}"
+            )
         if gains in CONTROLLERS and gains not in GAIN_PRESETS:
             raise ValueError(
                 f"StackPolicy has the paper's law and filter, gains {', '.join(GAIN_PRESETS)}; "
                 f"{gains!r} needs limits and an estimate of the slip"
             )
-        self._entries = sensor_entries(scenario.substeps)
-        self._scales = np.array([entry.scale for entry in self._entries.values()])
+        robots = scenario.robot_models
+        if len(set(robots)) == 1:
+            robots = robots[:1]
+        entries = sensor_entries(scenario.substeps)
+        self._scales = np.array([entry.scale for entry in entries.values()])
         self._settings = StackSettings(
-            body=body(scenario.robot),
+            bodies=body_array(list(robots)),
             ekf=ekf_constants(scenario.ekf),
             loop=digital_wheel_loop(wheel_loop, scenario.control_period_s),
             gains=gains_row(tracking_gains(gains)),
@@ -223,7 +243,8 @@ class StackPolicy:
         Raises
         ------
         ValueError
-            if the observation is not a ``sensor`` observation of the scenario.
+            if the observation is not a ``sensor`` observation of the scenario, or unlike robots
+            cannot be told apart by the number of rows.
         """
         observation = np.asarray(observation)
         if observation.ndim not in (1, 2) or observation.shape[-1] != len(self._scales):
@@ -233,6 +254,12 @@ class StackPolicy:
             )
         rows = np.ascontiguousarray(np.atleast_2d(observation))
         n = len(rows)
+        robots = self._settings.bodies.shape[1]
+        if n % robots:
+            raise ValueError(
+                f"the batch has {n} rows; the scenario's {robots} robots differ, and it needs a row "
+                "for each of them, or for each of several formations"
+            )
         if state is None or len(state.steps) != n:
             state = StackState(
                 np.zeros((len(Estimate._fields), n, 1)),

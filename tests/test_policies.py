@@ -9,7 +9,7 @@ from baselines.policies import enter, make_policy, overrides_told, policy_names
 from baselines.run import run_policy
 from baselines.stack import StackPolicy
 from tlf_env.onboard.tracking import controller
-from tlf_env.task.observation import tracking_entries
+from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.scenario import load_scenario
 
 SCENARIO = load_scenario(horizon_s=0.2)
@@ -152,6 +152,36 @@ def test_the_stack_has_the_papers_law_alone():
         StackPolicy(scenario, "tuned")
     with pytest.raises(ValueError, match=r"'bold' is not one of consistent, printed$"):
         StackPolicy(scenario, "bold")
+
+
+@pytest.mark.parametrize(
+    ("fields", "message"),
+    [
+        ({"estimator": "ekf-slip"}, "needs estimator 'ekf'; the scenario has 'ekf-slip'"),
+        ({"estimator": "truth"}, "needs estimator 'ekf'; the scenario has 'truth'"),
+        ({"estimator": "my:Filter"}, "needs estimator 'ekf'; the scenario has 'my:Filter'"),
+        ({"action": "twist"}, "needs action 'torque'; the scenario has 'twist'"),
+        ({"observation": "tracking"}, "needs observation 'sensor'; the scenario has 'tracking'"),
+        ({"control_period_s": 0.02}, "control_period_s 0.02 must be physics_period_s 0.001"),
+    ],
+)
+def test_the_stack_refuses_what_would_drive_another_way_than_on_board(fields, message):
+    fitting = {"observation": "sensor", "action": "torque", "control_period_s": 0.001}
+    with pytest.raises(ValueError, match=message):
+        StackPolicy(load_scenario(**{**fitting, **fields}))
+
+
+def test_a_stack_of_unlike_robots_needs_a_row_for_each():
+    scenario = load_scenario(
+        robots=[{}, {"wheel_radius_mm": 55}],
+        observation="sensor",
+        action="torque",
+        control_period_s=0.001,
+    )
+    rows = np.zeros((3, len(sensor_entries(1))))
+    with pytest.raises(ValueError, match=r"3 rows; the scenario's 2 robots differ"):
+        StackPolicy(scenario).predict(rows)
+    StackPolicy(scenario).predict(np.zeros((4, len(sensor_entries(1)))))
 
 
 @pytest.mark.parametrize("name", policy_names())

@@ -78,6 +78,15 @@ def test_both_routes_drive_the_same_way(task: str, dtype: str, within_mm: float)
     assert np.hypot(*(board.poses - start)[:, :2].T).min() > 100.0
 
 
+def test_both_routes_drive_unlike_robots_the_same_way() -> None:
+    other = {"axle_width_mm": 180, "wheel_radius_mm": 55, "wheel_inertia_kg_mm2": 78}
+    board, policy = (
+        route("infinity", dtype="float64", robots=[{}, other])
+        for route in (on_board, in_the_policy)
+    )
+    assert largest_distance(board, policy, seconds=5.0).max() < 1e-6
+
+
 @every_dtype
 @pytest.mark.parametrize("task", ["infinity", "flower"])
 @pytest.mark.slow
