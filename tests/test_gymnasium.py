@@ -489,13 +489,16 @@ def test_reset_starts_the_trajectory_at_a_phase(phase_s: Any) -> None:
         ({"poses": None}, r"poses must be 3 finite rows .* got the shape \(\): None"),
         ({"poses": "behind"}, "poses must be numbers.*'behind'"),
         ({"poses": [[0, 0], [1]]}, "poses must be numbers"),
+        ({"poses": np.zeros((4, 3))}, r"poses must be 3 finite rows .* got the shape \(4, 3\)"),
+        ({"poses": np.array([["a"], ["b"]])}, "poses must be numbers"),
     ],
 )
 def test_an_impossible_reset_option_is_named(options: dict[str, Any], message: str) -> None:
     for env in (FormationEnv(), tlf_env.parallel_env()):
         env.reset(seed=0)
-        with pytest.raises(ValueError, match=message):
+        with pytest.raises(ValueError, match=message) as caught:
             env.reset(options=options)
+        assert "\n" not in str(caught.value)
 
 
 # Many at once

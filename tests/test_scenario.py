@@ -166,6 +166,23 @@ def test_reward_weights_not_named_keep_their_defaults():
         ({"robots": -3}, ("robots", "-3")),
         ({"robots": 2.5}, ("robots", "2.5")),
         ({"robots": "many"}, ("robots", "many")),
+        ({"robots": True}, ("robots", "True", "a number")),
+        ({"robots": [1, 2]}, ("robots.0", "got 1", "robots.1", "got 2")),
+        ({"horizon_s": True}, ("horizon_s", "True", "a number")),
+        ({"horizon_s": 1e308}, ("horizon_s", "1e+308", "10000000 steps")),
+        ({"time_gap_s": 1e9}, ("time_gap_s", "1000000000.0", "10000000 steps")),
+        ({"time_gap_s": 1e300}, ("time_gap_s", "1e+300", "10000000 steps")),
+        ({"control_period_s": 1e308}, ("control_period_s", "1e+308", "10000000 steps")),
+        ({"preview_s": (1e308,)}, ("preview_s", "1e+308", "time_gap_s 5.0")),
+        ({"start_spacing_mm": 1e300}, ("start_spacing_mm", "1e+300", "1000000000")),
+        ({"name": ""}, ("name", "''", "letter")),
+        ({"name": ".."}, ("name", "'..'", "letter")),
+        ({"name": "../../up"}, ("name", "'../../up'", "letters, digits")),
+        ({"name": "a/b"}, ("name", "'a/b'", "letters, digits")),
+        ({"name": "/root"}, ("name", "'/root'", "letters, digits")),
+        ({"name": "two\nlines"}, ("name", "two", "letters, digits")),
+        ({"name": "x" * 101}, ("name", "100 letters")),
+        ({"adversary": 3}, ("adversary", "3", "callable")),
         ({"time_gap_s": 5.01}, ("time_gap_s", "5.01", "0.02")),
         ({"time_gap_s": 0.0}, ("time_gap_s", "0.0")),
         ({"time_gap_s": -5.0}, ("time_gap_s", "-5.0")),
@@ -185,7 +202,9 @@ def test_reward_weights_not_named_keep_their_defaults():
         ({"plant": "gazebo"}, ("plant", "gazebo", "pymunk", "kinematic")),
         ({"action": "voltage"}, ("action", "voltage", "twist")),
         ({"observation": "pixels"}, ("observation", "pixels", "tracking")),
-        ({"estimator": "ukf"}, ("estimator", "ukf", "ekf")),
+        ({"estimator": "ukf"}, ("estimator", "ukf", "'ekf'", "or module:factory")),
+        ({"wheel_loop": "ukf"}, ("wheel_loop", "ukf", "module:factory")),
+        ({"observer": "a b:c"}, ("observer", "a b:c", "module:factory")),
         ({"end_on": ("bored",)}, ("end_on", "bored", "lost")),
         ({"disturbance": "storm"}, ("storm", "nominal")),
         ({"disturbance": {"wind": {}}}, ("disturbance.wind", "unknown")),
@@ -200,6 +219,8 @@ def test_reward_weights_not_named_keep_their_defaults():
         ({"disturbance_level": NAN}, ("level", "nan")),
         ({"disturbance_level": INF}, ("level", "inf")),
         ({"disturbance_level": "high"}, ("level", "high")),
+        ({"disturbance_level": True}, ("level", "True")),
+        ({"disturbance": {"level": True}}, ("disturbance.level", "True")),
         ({"reward": {"style": 1.0}}, ("reward", "style", "coarse")),
         ({"reward": {"fine": NAN}}, ("reward", "fine", "nan")),
         ({"reward": 3.0}, ("reward", "3.0")),
@@ -212,6 +233,10 @@ def test_reward_weights_not_named_keep_their_defaults():
         ({"observer": {"gain_per_s": INF}}, ("gain_per_s", "inf")),
         ({"wheel_loop": {"gain_Nmm_s": NAN}}, ("gain_Nmm_s", "nan")),
         ({"trajectory": {"type": "spiral"}}, ("trajectory", "spiral", "rose")),
+        ({"trajectory": {"amplitude_x_mm": 1e200}}, ("amplitude_x_mm", "1e+200", "1000000000")),
+        ({"trajectory": {"centre_y_mm": -1e200}}, ("centre_y_mm", "-1e+200", "1000000000")),
+        ({"trajectory": {"rate_y_rad_s": 1e200}}, ("rate_y_rad_s", "1e+200", "10000")),
+        ({"trajectory": {"phase_x_rad": 1e200}}, ("phase_x_rad", "1e+200", "1000000000")),
         ({"tme_gap_s": 5.0}, ("tme_gap_s", "unknown")),
         ({"render_mode": "hologram"}, ("render_mode", "hologram")),
     ],
@@ -220,6 +245,32 @@ def test_an_impossible_value_is_refused_and_named(overrides, named):
     message = refusal("infinity", **overrides)
     for part in named:
         assert part in message
+
+
+@pytest.mark.parametrize(
+    ("overrides", "unwanted"),
+    [
+        ({"robots": [1, 2]}, "at least 1 item"),
+        ({"robots": [{"mass_kg": -1}]}, "at least 1 item"),
+        ({"estimator": "ukf"}, "pattern"),
+        ({"wheel_loop": "ukf"}, "pattern"),
+    ],
+)
+def test_a_refusal_says_nothing_that_misleads(overrides, unwanted):
+    assert unwanted not in refusal("infinity", **overrides)
+
+
+@pytest.mark.parametrize("source", [5, 1.5, None, ["infinity"], True])
+def test_what_is_no_scenario_is_refused(source):
+    assert repr(source) in refusal(source).replace('"', "")
+    with pytest.raises(ValueError, match="must be a preset's name"):
+        load_scenario(source)
+
+
+@pytest.mark.parametrize("source", [5, None])
+def test_a_batch_refuses_what_is_no_scenario(source):
+    with pytest.raises(ValueError, match="must be a preset's name"):
+        tlf_env.BatchPlant(source, 2)
 
 
 def test_a_preview_that_repeats_is_refused():
@@ -295,10 +346,49 @@ def test_unknown_gains_are_refused_with_the_presets_there_are():
         "robots: 3\n",  # no trajectory
         "trajectory: {type: rose, amplitude_x_mm: 1, amplitude_y_mm: 1, period_s: .nan}",
         "trajectory: {type: rose, amplitude_x_mm: 1, amplitude_y_mm: 1, period_s: 9}\nspeed: 3",
+        "trajectory: {type: circle, radius_mm: 1, speed_mm_s: 1.0e+300}",
+        "trajectory: {type: circle, radius_mm: 1.0e-300, speed_mm_s: 1}",
+        "trajectory: {type: circle, radius_mm: 1, period_s: 1.0e-300}",
+        "trajectory: {type: rose, amplitude_x_mm: 1, amplitude_y_mm: 1, petals_k: 1e8, period_s: 1}",
+        "trajectory: {type: stop_and_go, path: {type: circle, radius_mm: 500, period_s: 20}, "
+        "drive_s: 10, stop_s: 5, ramp_s: 1.0e-300}",
     ],
 )
 def test_a_broken_file_is_refused(tmp_path, text):
     refusal(written(tmp_path, text))
+
+
+@pytest.mark.parametrize("place", ["", "robot:\n  mass_kg: 1.245\n  "])
+def test_a_key_that_stands_twice_is_refused_and_named(tmp_path, place):
+    """YAML itself would take the last one in silence."""
+    inside = place.replace("mass_kg: 1.245", "gravity_mm_s2: 9807")
+    text = f"trajectory: {{type: circle, radius_mm: 1000, speed_mm_s: 100}}\n{inside}"
+    key = "horizon_s: 50" if not place else "mass_kg: 1.245"
+    indent = "  " if place else ""
+    load_scenario(written(tmp_path, f"{text}{key}\n"))
+    message = refusal(written(tmp_path, f"{text}{key}\n{indent}{key}\n"))
+    assert repr(key.split(":")[0]) in message
+    assert "twice" in message
+    assert "line 3" in message or "line 5" in message
+
+
+def test_a_merged_mapping_may_be_overridden(tmp_path):
+    text = (
+        "robot: &base {gravity_mm_s2: 1000}\n"
+        "robots: [{<<: *base, gravity_mm_s2: 2000}, *base]\n"
+        "trajectory: {type: circle, radius_mm: 1000, speed_mm_s: 100}\n"
+    )
+    models = load_scenario(written(tmp_path, text)).robot_models
+    assert [robot.gravity_mm_s2 for robot in models] == [2000, 1000]
+
+
+@pytest.mark.parametrize(
+    ("file", "name"),
+    [("my run (2).yaml", "my_run__2_"), (".yml.yaml", "_yml"), ("ä-1.yaml", "ä-1")],
+)
+def test_a_files_name_becomes_one_that_names_a_folder(tmp_path, file, name):
+    text = (presets_folder() / "flower.yaml").read_text(encoding="utf-8")
+    assert load_scenario(written(tmp_path, text, file)).name == name
 
 
 def test_a_missing_file_is_refused_and_named(tmp_path):

@@ -79,6 +79,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     ) -> None:
         overrides, parts = separate_parts(overrides)
         if adversary is not None:
+            if not callable(adversary):
+                raise ValueError(f"adversary {adversary!r} must be callable with the environment")
             overrides["adversary"] = True
         self.scenario = load_scenario(scenario, **overrides)
         for line in scenario_warnings(self.scenario):
@@ -345,12 +347,13 @@ def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | No
     try:
         poses = np.asarray(options["poses"], dtype=np.float64)
     except (TypeError, ValueError) as error:
-        raise ValueError(f"reset option poses must be numbers: {error}") from error
+        told = " ".join(f"{error}, got {options['poses']!r}".split())
+        raise ValueError(f"reset option poses must be numbers: {told}") from error
     if poses.shape != (robots, 3) or not (np.abs(poses) <= FARTHEST_START_MM).all():
         raise ValueError(
             f"reset option poses must be {robots} finite rows (x mm, y mm, θ rad) "
             f"within ±{FARTHEST_START_MM:g}, "
-            f"got the shape {poses.shape}: {options['poses']!r}"
+            f"got the shape {poses.shape}: {' '.join(repr(options['poses']).split())}"
         )
     return poses, float(phase_s)
 

@@ -64,7 +64,7 @@ class BatchPlant:
         mixture: bool | Sequence[float] = False,
         **overrides: Any,
     ) -> None:
-        if isinstance(scenario, str | Path | Mapping | Scenario):
+        if not isinstance(scenario, Sequence) or isinstance(scenario, str):
             scenario = [scenario]
         self.scenarios = _alike([_for_lanes(source, overrides) for source in scenario])
         self.formations = _positive("formations", formations)

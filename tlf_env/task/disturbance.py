@@ -10,7 +10,7 @@ import math
 from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
-from pydantic import BeforeValidator, Field, FiniteFloat, model_validator
+from pydantic import BeforeValidator, FiniteFloat, model_validator
 
 from tlf_env.numerics.compiled import law, reader
 from tlf_env.physics.parameters import Body, Frozen, NonNegative, Positive
@@ -105,7 +105,7 @@ class Disturbance(Frozen):
     """All channels; the defaults are nominal."""
 
     name: str = "custom"
-    level: Annotated[FiniteFloat, Field(ge=0)] = 1.0
+    level: NonNegative = 1.0
     slip: SlipChannels = SlipChannels()
     tyre: TyreChannels = TyreChannels()
     position: PositionChannels = PositionChannels()

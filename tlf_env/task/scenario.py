@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import functools
 import math
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Self
 
 import yaml
-from pydantic import Field, FiniteFloat, ValidationError, field_validator, model_validator
+from pydantic import (
+    AfterValidator,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+from pydantic_core import PydanticCustomError
 
 from tlf_env.numerics.errors import one_line
 from tlf_env.onboard.estimator import EkfParameters
@@ -18,12 +27,18 @@ from tlf_env.onboard.parts import PART_PATTERN
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import controller, controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
-from tlf_env.physics.parameters import Frozen, NonNegative, Positive, RobotParameters
+from tlf_env.physics.parameters import (
+    Frozen,
+    NonNegative,
+    Positive,
+    RobotParameters,
+    no_switch,
+)
 from tlf_env.task.disturbance import Disturbance
 from tlf_env.task.feasibility import warnings_for
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
 from tlf_env.task.trajectories import Trajectory
-from tlf_env.task.waypoints import scenario_of_waypoints
+from tlf_env.task.waypoints import MAX_MAGNITUDE, scenario_of_waypoints
 
 PACKAGE = Path(__file__).resolve().parent.parent
 MAX_ROBOTS = 1000
@@ -34,9 +49,19 @@ SETTLE_FRACTION = 0.4
 START_MARGIN_MM = 1.0  # between outlines at the start
 DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
+NAME = re.compile(r"\w[\w.+-]{0,99}")  # a folder of results is named by it
+NOT_IN_NAMES = re.compile(r"^[^\w]+|[^\w.+-]")
 
 EndReason = Literal["lost", "touched"]
-PartPath = Annotated[str, Field(pattern=PART_PATTERN)]
+
+
+def _part_path(value: str) -> str:
+    if not re.match(PART_PATTERN, value):
+        raise PydanticCustomError("part_path", "Input should be module:factory")
+    return value
+
+
+PartPath = Annotated[str, AfterValidator(_part_path)]
 
 
 class FrozenDict(dict[str, float]):
@@ -65,18 +90,42 @@ def preset_names(folder: Path | None = None) -> list[str]:
     return sorted(path.stem for path in (folder or presets_folder()).glob("*.yaml"))
 
 
+class _RepeatedKeyError(ValueError):
+    """A YAML mapping has a key twice."""
+
+
+class _Loader(yaml.SafeLoader):
+    """YAML's safe loader, which would keep the last of two equal keys in silence, but for that."""
+
+    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
+        """The mapping as written: what it merges with ``<<`` it may override."""
+        node = super().compose_mapping_node(anchor)
+        seen = set()
+        for key, _ in node.value:
+            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
+                if key.value in seen:
+                    line = key.start_mark.line + 1
+                    raise _RepeatedKeyError(
+                        f"line {line}: the key {key.value!r} stands there twice"
+                    )
+                seen.add(key.value)
+        return node
+
+
 def read_yaml(path: Path) -> dict[str, Any]:
     """A YAML file as a mapping.
 
     Raises
     ------
     ValueError
-        in one line, if the file is missing, is not YAML, or is not a mapping.
+        in one line, if the file is missing, is not YAML, is not a mapping, or has a key twice.
     """
     try:
-        data = yaml.safe_load(path.read_text(encoding="utf-8"))
+        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
+    except _RepeatedKeyError as error:
+        raise ValueError(f"{path}, {error}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
@@ -110,7 +159,7 @@ class Scenario(Frozen):
     ) = 3  # how many, or each one's parameters where they differ from `robot`
     robot: RobotParameters = RobotParameters()
     time_gap_s: Positive = 5.0
-    start_spacing_mm: Positive = 300.0
+    start_spacing_mm: Annotated[Positive, Field(le=MAX_MAGNITUDE)] = 300.0
 
     physics_period_s: Positive = 0.001
     control_period_s: Positive = DEFAULT_CONTROL_PERIOD_S
@@ -159,6 +208,21 @@ class Scenario(Frozen):
             ]
         return data
 
+    @field_validator("name", mode="after")
+    @classmethod
+    def _names_a_folder(cls, value: str) -> str:
+        if not NAME.fullmatch(value):
+            raise ValueError(
+                f"must be 1 to 100 letters, digits and _ . + -, a letter, digit or _ first, "
+                f"got {value!r}"
+            )
+        return value
+
+    @field_validator("robots", mode="before")
+    @classmethod
+    def _how_many(cls, value: Any) -> Any:
+        return no_switch(value)
+
     @field_validator("disturbance", mode="before")
     @classmethod
     def _named_disturbance(cls, value: Any) -> Any:
@@ -183,6 +247,12 @@ class Scenario(Frozen):
 
     @model_validator(mode="after")
     def _check(self) -> Self:
+        for name in ("control_period_s", "time_gap_s", "horizon_s"):
+            if getattr(self, name) / self.physics_period_s > MAX_STEPS:
+                raise ValueError(
+                    f"{name} {getattr(self, name)} is more than {MAX_STEPS} steps of "
+                    f"physics_period_s {self.physics_period_s}"
+                )
         for name in ("control_period_s",):
             if whole_steps(getattr(self, name), self.physics_period_s) in (None, 0):
                 raise ValueError(
@@ -198,20 +268,16 @@ class Scenario(Frozen):
         if len(set(self.preview_s)) < len(self.preview_s):
             raise ValueError(f"preview_s {self.preview_s} must not hold a time twice")
         for time_s in self.preview_s:
-            if time_s and whole_steps(time_s, self.control_period_s) is None:
-                raise ValueError(
-                    f"preview_s {time_s} must be a multiple of control_period_s "
-                    f"{self.control_period_s}"
-                )
             if time_s > self.time_gap_s:
                 raise ValueError(
                     f"preview_s {time_s} is beyond time_gap_s {self.time_gap_s}: what a follower "
                     "will be told further ahead does not exist yet"
                 )
-        if self.horizon_s / self.physics_period_s > MAX_STEPS:
-            raise ValueError(
-                f"horizon_s {self.horizon_s} is more than {MAX_STEPS} steps of physics_period_s"
-            )
+            if time_s and whole_steps(time_s, self.control_period_s) is None:
+                raise ValueError(
+                    f"preview_s {time_s} must be a multiple of control_period_s "
+                    f"{self.control_period_s}"
+                )
         room_mm = 2 * max(robot.outline_radius_mm for robot in self.robot_models)
         if self.robot_count > 1 and self.start_spacing_mm < room_mm + START_MARGIN_MM:
             raise ValueError(
@@ -347,15 +413,25 @@ def _read_source(source: str | Path, control_period_s: float | None) -> dict[str
     text = str(source)
     if text in preset_names():
         return {"name": text, **read_yaml(presets_folder() / f"{text}.yaml")}
+    if not isinstance(source, str | Path):
+        raise ValueError(
+            f"scenario {text!r:.60} must be a preset's name, a file, a mapping or a Scenario"
+        )
     path = Path(source)
     if path.suffix in (".yaml", ".yml"):
-        return {"name": path.stem, **read_yaml(path)}
+        return {"name": name_of(path), **read_yaml(path)}
     if path.suffix == ".csv":
-        return scenario_of_waypoints(path, control_period_s or DEFAULT_CONTROL_PERIOD_S)
+        found = scenario_of_waypoints(path, control_period_s or DEFAULT_CONTROL_PERIOD_S)
+        return {**found, "name": name_of(path)}
     raise ValueError(
         f"scenario {text!r} is neither a preset ({', '.join(preset_names())}), nor a .yaml file, "
         "nor a .csv file of waypoints"
     )
+
+
+def name_of(path: Path) -> str:
+    """The name of a scenario that is known by its file: what a name cannot hold becomes ``_``."""
+    return NOT_IN_NAMES.sub("_", path.stem)[:100]
 
 
 @functools.lru_cache(maxsize=64)
@@ -406,6 +482,11 @@ def _with_level(disturbance: Any, level: float) -> dict[str, Any]:
         disturbance = _disturbance_preset(disturbance)
     elif isinstance(disturbance, Disturbance):
         disturbance = disturbance.model_dump()
-    if not isinstance(level, int | float) or not math.isfinite(level) or level < 0:
+    if (
+        isinstance(level, bool)
+        or not isinstance(level, int | float)
+        or not math.isfinite(level)
+        or level < 0
+    ):
         raise ValueError(f"disturbance_level {level!r} must be a finite number, at least 0")
     return {**disturbance, "level": level}

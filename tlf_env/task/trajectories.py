@@ -15,12 +15,26 @@ import numpy as np
 from pydantic import Field, FiniteFloat, ValidationInfo, field_validator, model_validator
 
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive
-from tlf_env.task.waypoints import Point, checked_points, drive_through, read_points
+from tlf_env.task.waypoints import (
+    MAX_MAGNITUDE,
+    Point,
+    checked_points,
+    drive_through,
+    read_points,
+)
 
 REFERENCE_COLUMNS = ("x_mm", "y_mm", "theta_rad", "u_1_mm_s", "u_2_rad_s")
 
 STILL_MM_S = 1e-10  # below it a velocity has no direction: rounding
 NEARBY_S = 1e-5  # how long before such an instant the heading is taken
+
+# Far beyond any robot, and small enough that no square or product overflows.
+MAX_RATE_RAD_S = 1e4
+SHORTEST_RAMP_S = 1e-6
+
+Coordinate = Annotated[FiniteFloat, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]  # mm, or rad
+Size = Annotated[Positive, Field(le=MAX_MAGNITUDE)]  # mm, mm/s, s
+Rate = Annotated[Positive, Field(le=MAX_RATE_RAD_S)]
 
 
 class _Timed(Frozen):
@@ -65,12 +79,30 @@ def _derivative(terms: list[Sinusoid], t_s: np.ndarray, order: int) -> np.ndarra
 class _Harmonic(_Timed):
     """A sum of sinusoids per axis, so that its derivatives are sums of sinusoids too."""
 
-    centre_x_mm: FiniteFloat = 0.0
-    centre_y_mm: FiniteFloat = 0.0
+    centre_x_mm: Coordinate = 0.0
+    centre_y_mm: Coordinate = 0.0
 
     @abstractmethod
     def sinusoids(self) -> tuple[list[Sinusoid], list[Sinusoid]]:
         """The terms of x and of y about the centre."""
+
+    @model_validator(mode="after")
+    def _bound(self) -> Self:
+        terms = [term for axis in self.sinusoids() for term in axis]
+        fastest = max(abs(term.rate_rad_s) for term in terms)
+        if not fastest <= MAX_RATE_RAD_S:
+            raise ValueError(
+                f"{self._told_rate()} makes {fastest:g} rad/s; at most {MAX_RATE_RAD_S:g} is allowed"
+            )
+        return self
+
+    def _told_rate(self) -> str:
+        """The fields that the rates follow from, with their values."""
+        return ", ".join(f"{name} {getattr(self, name):g}" for name in self._rate_fields())
+
+    @abstractmethod
+    def _rate_fields(self) -> list[str]:
+        """The names of those fields."""
 
     def derivatives(self, t_s: np.ndarray) -> np.ndarray:
         """Position, velocity and acceleration: ``(3, 2, ...)`` in mm, mm/s, mm/s²."""
@@ -86,12 +118,12 @@ class Lissajous(_Harmonic):
     """x = A sin(a t + α) + x₀, y = B sin(b t + β) + y₀. The paper's ∞ is eq. (52): A = B, b = 2a."""
 
     type: Literal["lissajous"] = "lissajous"
-    amplitude_x_mm: Positive
-    amplitude_y_mm: Positive
-    rate_x_rad_s: Positive
-    rate_y_rad_s: Positive
-    phase_x_rad: FiniteFloat = 0.0
-    phase_y_rad: FiniteFloat = 0.0
+    amplitude_x_mm: Size
+    amplitude_y_mm: Size
+    rate_x_rad_s: Rate
+    rate_y_rad_s: Rate
+    phase_x_rad: Coordinate = 0.0
+    phase_y_rad: Coordinate = 0.0
 
     def sinusoids(self) -> tuple[list[Sinusoid], list[Sinusoid]]:
         """One term per axis."""
@@ -100,15 +132,18 @@ class Lissajous(_Harmonic):
             [Sinusoid(self.amplitude_y_mm, self.rate_y_rad_s, self.phase_y_rad)],
         )
 
+    def _rate_fields(self) -> list[str]:
+        return ["rate_x_rad_s", "rate_y_rad_s"]
+
 
 class Rose(_Harmonic):
     """x = A cos(k s) sin s + x₀, y = −B cos(k s) cos s + y₀, s = 2πt/period. Eq. (53): k = 2, 120 s."""
 
     type: Literal["rose"] = "rose"
-    amplitude_x_mm: Positive
-    amplitude_y_mm: Positive
-    petals_k: Positive = 2.0
-    period_s: Positive
+    amplitude_x_mm: Size
+    amplitude_y_mm: Size
+    petals_k: Size = 2.0
+    period_s: Size
 
     def sinusoids(self) -> tuple[list[Sinusoid], list[Sinusoid]]:
         """Two terms per axis: the products of eq. (53) as sums."""
@@ -119,6 +154,9 @@ class Rose(_Harmonic):
             [Sinusoid(half_x, fast, 0.0), Sinusoid(-half_x, slow, 0.0)],
             [Sinusoid(-half_y, fast, np.pi / 2), Sinusoid(-half_y, slow, np.pi / 2)],
         )
+
+    def _rate_fields(self) -> list[str]:
+        return ["petals_k", "period_s"]
 
 
 class Circle(_Harmonic):
@@ -131,11 +169,11 @@ class Circle(_Harmonic):
     """
 
     type: Literal["circle"] = "circle"
-    radius_mm: Positive
-    period_s: Positive | None = None
-    speed_mm_s: Positive | None = None
+    radius_mm: Size
+    period_s: Size | None = None
+    speed_mm_s: Size | None = None
     direction: Literal["counterclockwise", "clockwise"] = "counterclockwise"
-    phase_rad: FiniteFloat = 0.0  # φ: where it starts, from +x
+    phase_rad: Coordinate = 0.0  # φ: where it starts, from +x
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -158,6 +196,9 @@ class Circle(_Harmonic):
             [Sinusoid(self.radius_mm, rate, self.phase_rad + np.pi / 2)],
             [Sinusoid(self.radius_mm, rate, self.phase_rad)],
         )
+
+    def _rate_fields(self) -> list[str]:
+        return ["period_s"] if self.speed_mm_s is None else ["radius_mm", "speed_mm_s"]
 
 
 class Waypoints(_Timed):
@@ -242,9 +283,9 @@ class StopAndGo(_Timed):
 
     type: Literal["stop_and_go"] = "stop_and_go"
     path: Plain
-    drive_s: Positive
-    stop_s: NonNegative
-    ramp_s: Positive = 2.0
+    drive_s: Size
+    stop_s: Annotated[NonNegative, Field(le=MAX_MAGNITUDE)]
+    ramp_s: Annotated[Size, Field(ge=SHORTEST_RAMP_S)] = 2.0
 
     @model_validator(mode="after")
     def _check(self) -> Self:
