@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import json
 import math
+import re
 from collections.abc import Iterator
 
+import gymnasium
+import numpy as np
 import pytest
 import yaml
 from pydantic import ValidationError
 
 import tlf_env
 from baselines import ReferencePolicy
+from tlf_env.envs.parallel import ReferenceWarning
+from tlf_env.envs.single import FormationEnv
+from tlf_env.task.observation import OBSERVATION_LIMIT, SAMPLE_ENTRIES
 from tlf_env.task.scenario import (
     Scenario,
     load_scenario,
     preset_names,
     presets_folder,
+    scenario_notes,
     scenario_warnings,
 )
+from tlf_env.task.trajectories import sample
 
 NAN, INF = math.nan, math.inf
 
@@ -474,3 +482,137 @@ def test_a_base_that_needs_a_slip_estimate_says_so():
         assert not any(
             "estimates none" in one for one in scenario_warnings(load_scenario(needs, **fields))
         )
+
+
+# Warnings
+
+
+def grip_warnings(**fields) -> list[str]:
+    return scenario_warnings(load_scenario("infinity", **fields))
+
+
+def test_constant_friction_warns_as_the_same_tyres_do():
+    tyre = load_scenario("infinity").robot.tyre
+    weak = {"mu_static": 0.2 * tyre.mu_static, "mu_dynamic": 0.2 * tyre.mu_dynamic}
+    expected = grip_warnings(robot={"tyre": weak})
+    assert any("drive wheels break loose" in line for line in expected)
+    for told in (
+        {"tyre": {"friction_scale": 0.2}},
+        {"tyre": {"friction_scale": 0.6}, "level": 2.0},
+        {"tyre": {"friction_scale": {"type": "constant", "value": 0.2}}},
+    ):
+        assert grip_warnings(disturbance=told) == expected
+
+
+@pytest.mark.parametrize("wheel", ["torque_gain_l", "torque_gain_r"])
+def test_a_weak_motor_warns_as_a_lower_limit_does(wheel):
+    expected = grip_warnings(robot={"torque_limit_Nmm": 7.5})
+    assert any("N·mm of a motor, above 7.5" in line for line in expected)
+    assert grip_warnings(disturbance={"actuator": {wheel: 0.5}}) == expected
+
+
+@pytest.mark.parametrize(
+    "told",
+    [
+        {"tyre": {"friction_scale": 0.2}, "level": 0.0},
+        {"tyre": {"friction_scale": {"type": "uniform", "low": 0.1, "high": 0.2}}},
+        {"tyre": {"friction_scale": {"type": "step", "value": 0.2, "at_s": 5.0}}},
+        {"actuator": {"torque_gain_l": {"type": "gaussian", "std": 0.1}}},
+        {"tyre": {"friction_scale": 2.0}},
+    ],
+)
+def test_what_is_not_constantly_weak_does_not_warn(told):
+    assert grip_warnings(disturbance=told) == []
+
+
+def test_a_motor_that_gives_nothing_is_told():
+    dead = {"actuator": {"torque_gain_l": 0.0, "torque_gain_r": 0.0}}
+    assert any(
+        "above 0 (on a straight they give 0" in line for line in grip_warnings(disturbance=dead)
+    )
+    (note,) = scenario_notes(load_scenario("infinity", disturbance=dead))
+    assert "0 N·mm do not move the leader" in note
+
+
+def test_the_start_at_speed_is_a_note_with_the_motors_that_there_are():
+    (note,) = scenario_notes(load_scenario("infinity"))
+    assert "starts at 559 mm/s" in note
+    (weak,) = scenario_notes(
+        load_scenario("infinity", disturbance={"actuator": {"torque_gain_l": 0.8}})
+    )
+    assert note != weak
+    assert scenario_notes(load_scenario("stop_and_go")) == []
+
+
+CIRCLE = {"type": "circle", "speed_mm_s": 400.0}
+
+
+def sensor_lines(radius_mm: float = 1000.0, centre_x_mm: float = 0.0, **fields) -> list[str]:
+    trajectory = {**CIRCLE, "radius_mm": radius_mm, "centre_x_mm": centre_x_mm}
+    data = {"trajectory": trajectory, "observation": "sensor", "horizon_s": 100.0, **fields}
+    return [line for line in scenario_warnings(load_scenario(data)) if "observation" in line]
+
+
+@pytest.mark.parametrize("name", ["infinity", "flower", "circle", "stop_and_go"])
+def test_no_preset_is_beyond_what_sensors_tell(name):
+    lines = scenario_warnings(load_scenario(name, observation="sensor"))
+    assert not any("observation" in line for line in lines)
+
+
+def test_a_reference_beyond_the_fixes_is_told_with_its_place():
+    assert sensor_lines(4900.0) == []
+    (line,) = sensor_lines(5100.0)
+    assert "from the start of robot_0" in line
+    assert "±10000 mm" in line
+    assert re.match(r"t = \d+\.\d\d s at \(-?\d+, -?\d+\) mm", line)
+    assert sensor_lines(5100.0, observation="tracking") == []
+
+
+def test_the_sensor_warning_is_where_the_entry_saturates():
+    """The first time that is told is the first at which an entry of a perfect fix is clipped."""
+    (line,) = sensor_lines(5100.0)
+    told_s = float(re.match(r"t = (\S+) s", line)[1])
+    scale = SAMPLE_ENTRIES["fix_x"].scale
+    trajectory = load_scenario({"trajectory": {**CIRCLE, "radius_mm": 5100.0}}).trajectory
+    start, before, at = sample(trajectory, np.array([0.0, told_s - 0.02, told_s + 0.01]))[:, :2]
+    assert np.abs(before - start).max() / scale < OBSERVATION_LIMIT
+    assert np.abs(at - start).max() / scale > OBSERVATION_LIMIT
+
+
+def test_only_robots_that_get_that_far_count():
+    """A follower that sets out last is not driven as far as the leader within the horizon."""
+    every = sensor_lines(5100.0, robots=2, time_gap_s=5.0)
+    late = sensor_lines(5100.0, robots=2, time_gap_s=90.0)
+    assert "2 robots in all" in every[0]
+    assert "in all" not in late[0]
+
+
+def test_a_start_beyond_the_world_is_told_with_its_place():
+    assert sensor_lines(1000.0, 8900.0) == []
+    (line,) = sensor_lines(1000.0, 9100.0)
+    assert "robot_0 starts at (10100, 0) mm" in line
+    assert "±10000 mm" in line
+    (line,) = sensor_lines(1000.0, 0.0, robots=40)
+    assert "robot_34 starts at (1000, -10200) mm" in line
+    assert "6 robots in all" in line
+
+
+def test_a_horizon_beyond_the_clock_is_told():
+    assert sensor_lines(horizon_s=1000.0) == []
+    (line,) = sensor_lines(horizon_s=1000.02)
+    assert "t = 1000 s" in line
+    assert "1000.02 s" in line
+
+
+def test_a_warning_points_at_who_makes_the_environment():
+    far = {"trajectory": {**CIRCLE, "radius_mm": 1000.0, "speed_mm_s": 1100.0}}
+    makers = (
+        lambda: tlf_env.parallel_env(far),
+        lambda: tlf_env.aec_env(far),
+        lambda: FormationEnv(far),
+        lambda: gymnasium.make("tlf_env/Infinity-v0", trajectory=far["trajectory"]),
+    )
+    for make in makers:
+        with pytest.warns(ReferenceWarning) as caught:
+            make()
+        assert {item.filename for item in caught if item.category is ReferenceWarning} == {__file__}

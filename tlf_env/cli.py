@@ -103,7 +103,7 @@ def run(
     from baselines.policies import enter, overrides_told
     from baselines.run import run_policy, summary, write_mat, write_record
     from tlf_env.numerics.philox import checked_seed
-    from tlf_env.task.scenario import load_scenario, scenario_warnings
+    from tlf_env.task.scenario import load_scenario, scenario_notes, scenario_warnings
 
     chosen = load_scenario(
         scenario,
@@ -118,6 +118,8 @@ def run(
         horizon_s=horizon_s,
     )
     for line in scenario_warnings(chosen):
+        notes.print(f"tlf: warning: {line}", markup=False, soft_wrap=True)
+    for line in scenario_notes(chosen):
         notes.print(f"tlf: note: {line}", markup=False, soft_wrap=True)
     checked_seed(seed)
     name = named_policy(policy, gains)

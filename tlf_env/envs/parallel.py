@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import secrets
+import sys
 import warnings
 from collections.abc import Callable, Mapping
 from numbers import Real
@@ -34,8 +35,19 @@ FARTHEST_START_MM = 1e9
 PETTINGZOO_TEST_OPTION = "options"  # what PettingZoo's own API test passes; means nothing
 
 
+MAKERS = ("tlf_env", "gymnasium", "pettingzoo")  # packages between a caller and the environment
+
+
 class ReferenceWarning(UserWarning):
-    """The reference asks something that the robots cannot do."""
+    """The reference asks something that the robots cannot do, or that an observation cannot tell."""
+
+
+def callers_level() -> int:
+    """``stacklevel`` for a warning from the calling function: the first frame of no maker."""
+    level, frame = 1, sys._getframe(1)
+    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in MAKERS:
+        level, frame = level + 1, frame.f_back
+    return level
 
 
 @documented
@@ -84,7 +96,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             overrides["adversary"] = True
         self.scenario = load_scenario(scenario, **overrides)
         for line in scenario_warnings(self.scenario):
-            warnings.warn(line, ReferenceWarning, stacklevel=2)
+            warnings.warn(line, ReferenceWarning, stacklevel=callers_level())
         self.metadata: dict[str, Any] = {
             "name": f"tlf_env/{self.scenario.name}-v0",
             "render_modes": RENDER_MODES,

@@ -120,6 +120,13 @@ class Disturbance(Frozen):
         group, name = path.split(".")
         return getattr(getattr(self, group), name)
 
+    def constant(self, path: str) -> float | None:
+        """The value that a channel always has, the level in it; None where it varies or is drawn."""
+        signal = self.signal(path)
+        if not isinstance(signal, Constant):
+            return None
+        return leveled(CHANNELS[PATHS.index(path)].nominal, signal.value, self.level)
+
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
         for channel in CHANNELS:

@@ -13,6 +13,11 @@ import numpy as np
 
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, RobotParameters, body
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
+from tlf_env.task.observation import (
+    OBSERVATION_LIMIT,
+    SAMPLE_ENTRIES,
+    SENSOR_TAIL_ENTRIES,
+)
 from tlf_env.task.trajectories import Trajectory, sample
 
 SAMPLE_S = 0.01
@@ -24,6 +29,10 @@ NAMED = 6  # at most, of the distances at which robots meet
 RATE_S = 0.1  # a robot may take so long over a change of speed or of yaw rate
 TURNS_RAD_S = 0.01  # slower, the castor need not swing
 SPOT_MM = 1.0  # a turn within a sample that travels less than this is on the spot
+# What the observation `sensor` can tell before it is clipped.
+FARTHEST_FIX_MM = OBSERVATION_LIMIT * SAMPLE_ENTRIES["fix_x"].scale
+FARTHEST_START_MM = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["start_x"].scale
+LONGEST_S = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["time"].scale
 
 
 def motor_acceleration(robot: RobotParameters) -> float:
@@ -39,6 +48,19 @@ def grip_acceleration(robot: RobotParameters) -> tuple[float, float]:
     """
     carried = 2 * robot.drive_load_share * robot.gravity_mm_s2
     return robot.tyre.mu_static * carried, robot.tyre.mu_dynamic * carried
+
+
+def disturbed(robot: RobotParameters, friction_scale: float, torque_gain: float) -> RobotParameters:
+    """The robot with its tyres' friction and its motors' torque scaled by factors, each at least 0."""
+    tyre = robot.tyre.model_copy(
+        update={
+            "mu_static": friction_scale * robot.tyre.mu_static,
+            "mu_dynamic": friction_scale * robot.tyre.mu_dynamic,
+        }
+    )
+    return robot.model_copy(
+        update={"tyre": tyre, "torque_limit_Nmm": torque_gain * robot.torque_limit_Nmm}
+    )
 
 
 def _motor_torque(
@@ -88,6 +110,11 @@ def start_note(trajectory: Trajectory, robot: RobotParameters) -> str | None:
     if u_1 <= STANDS_MM_S:
         return None
     limit = motor_acceleration(robot)
+    if limit <= 0:
+        return (
+            f"the reference starts at {u_1:.0f} mm/s and the robots at rest: "
+            f"{robot.torque_limit_Nmm:g} N·mm do not move the leader"
+        )
     return (
         f"the reference starts at {u_1:.0f} mm/s and the robots at rest: at full torque "
         f"({limit:.0f} mm/s²) the leader needs {u_1 / limit:.1f} s to reach that speed, and is then "
@@ -111,11 +138,7 @@ def warnings_for(
     that follow one ``time_gap_s`` apart, lined up ``start_spacing_mm`` apart at the start. Each line
     names the worst place, the value and the limit.
     """
-    gap_steps = math.ceil(time_gap_s / max(SAMPLE_S, horizon_s / MAX_SAMPLES))
-    step_s = time_gap_s / gap_steps
-    t_s = np.arange(math.floor(horizon_s / step_s + 1e-9) + 1) * step_s
-    if len(t_s) < 2:
-        t_s = np.array([0.0, horizon_s])
+    t_s, gap_steps = _times(horizon_s, time_gap_s)
     reference = sample(trajectory, t_s)
     return [
         *_stands(t_s, reference),
@@ -125,6 +148,85 @@ def warnings_for(
         *_grip(t_s, reference, robot),
         *_meetings(t_s, reference, robot, robots, gap_steps, start_spacing_mm),
     ]
+
+
+def sensor_warnings(
+    trajectory: Trajectory,
+    horizon_s: float,
+    *,
+    robots: int = 1,
+    time_gap_s: float = 5.0,
+    start_spacing_mm: float = 300.0,
+) -> list[str]:
+    """A line for each thing within the horizon that the observation ``sensor`` clips in silence.
+
+    Position fixes and messages count from a robot's own start and are clipped at ±10 m per
+    coordinate; so are the start's coordinates in the world, and ``time`` at 1000 s. Robot i drives
+    what the reference drives until i gaps before the horizon. Each line names the first place, the
+    value and the limit.
+    """
+    t_s, gap_steps = _times(horizon_s, time_gap_s)
+    reference = sample(trajectory, t_s)
+    x, y, theta = reference[0, :3]
+    behind = start_spacing_mm * np.arange(robots)[:, None]
+    starts = np.array([x, y]) + behind * np.array([math.sin(theta), -math.cos(theta)])
+    return [
+        *_far_starts(starts),
+        *_far_places(t_s, reference, starts, gap_steps),
+        *_long_horizon(horizon_s),
+    ]
+
+
+def _far_starts(starts: np.ndarray) -> Iterator[str]:
+    far = np.abs(starts).max(axis=1) > FARTHEST_START_MM
+    if far.any():
+        i = _first(far)
+        yield (
+            f"t = 0 s: robot_{i} starts at ({starts[i, 0]:.0f}, {starts[i, 1]:.0f}) mm; observation "
+            f"'sensor' clips start_x and start_y at ±{FARTHEST_START_MM:.0f} mm{_and_more(far)}"
+        )
+
+
+def _far_places(
+    t_s: np.ndarray, reference: np.ndarray, starts: np.ndarray, gap_steps: int
+) -> Iterator[str]:
+    """Per robot by the extremes so far: a robot behind drives a shorter part of the same path."""
+    places = reference[:, :2]
+    low, high = np.minimum.accumulate(places), np.maximum.accumulate(places)
+    last = len(t_s) - 1 - gap_steps * np.arange(len(starts))
+    driven = last >= 0
+    k = np.maximum(last, 0)
+    far = driven & (np.maximum(high[k] - starts, starts - low[k]).max(axis=1) > FARTHEST_FIX_MM)
+    if far.any():
+        i = _first(far)
+        apart = places - starts[i]
+        at = _first(np.abs(apart).max(axis=1) > FARTHEST_FIX_MM)
+        yield (
+            f"{_place(t_s, reference, at)}: the reference is ({apart[at, 0]:.0f}, "
+            f"{apart[at, 1]:.0f}) mm from the start of robot_{i}; observation 'sensor' clips fixes "
+            f"and messages at ±{FARTHEST_FIX_MM:.0f} mm from it{_and_more(far)}"
+        )
+
+
+def _and_more(far: np.ndarray) -> str:
+    """How many robots are concerned, if more than one."""
+    return f" ({np.count_nonzero(far)} robots in all)" if np.count_nonzero(far) > 1 else ""
+
+
+def _long_horizon(horizon_s: float) -> Iterator[str]:
+    if horizon_s > LONGEST_S:
+        yield (
+            f"t = {LONGEST_S:.0f} s: observation 'sensor' clips time there; the horizon is "
+            f"{horizon_s:g} s"
+        )
+
+
+def _times(horizon_s: float, time_gap_s: float) -> tuple[np.ndarray, int]:
+    """Times (s) to look at, and how many of them make a gap: 10 ms apart, more over long horizons."""
+    gap_steps = math.ceil(time_gap_s / max(SAMPLE_S, horizon_s / MAX_SAMPLES))
+    step_s = time_gap_s / gap_steps
+    t_s = np.arange(math.floor(horizon_s / step_s + 1e-9) + 1) * step_s
+    return (t_s if len(t_s) >= 2 else np.array([0.0, horizon_s])), gap_steps
 
 
 def _place(t_s: np.ndarray, reference: np.ndarray, k: int) -> str:
@@ -213,14 +315,14 @@ def _motors(t_s: np.ndarray, reference: np.ndarray, robot: RobotParameters) -> I
         yield (
             f"{_place(t_s, reference, k)}: changing speed by {acceleration[k]:.0f} mm/s² and yaw rate "
             f"by {yaw_acceleration[k]:.2g} rad/s² needs {torque[k]:.1f} N·mm of a motor, above "
-            f"{robot.torque_limit_Nmm:g} (on a straight they give {motor_acceleration(robot):.0f} "
-            "mm/s²)"
+            f"{robot.torque_limit_Nmm:g} (on a straight they give "
+            f"{max(motor_acceleration(robot), 0.0):.0f} mm/s²)"
         )
 
 
 def _grip(t_s: np.ndarray, reference: np.ndarray, robot: RobotParameters) -> Iterator[str]:
     lateral = reference[:, 3] * reference[:, 4]
-    motors = motor_acceleration(robot)
+    motors = max(motor_acceleration(robot), 0.0)
     along = np.clip(_rate(t_s, reference[:, 3]), -motors, motors)
     total = np.hypot(lateral, along)
     holds, gives = grip_acceleration(robot)

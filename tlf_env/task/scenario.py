@@ -35,7 +35,7 @@ from tlf_env.physics.parameters import (
     no_switch,
 )
 from tlf_env.task.disturbance import Disturbance
-from tlf_env.task.feasibility import warnings_for
+from tlf_env.task.feasibility import disturbed, sensor_warnings, start_note, warnings_for
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
 from tlf_env.task.trajectories import Trajectory
 from tlf_env.task.waypoints import MAX_MAGNITUDE, scenario_of_waypoints
@@ -450,10 +450,14 @@ def _warnings_for(*what: Any) -> tuple[str, ...]:
 
 
 def scenario_warnings(scenario: Scenario) -> list[str]:
-    """What of the scenario its robots cannot do, a line each."""
+    """What of the scenario its robots cannot do or be told, a line each.
+
+    Constant friction and torque gains of the disturbance are in the robots' limits, at its level;
+    what varies or is drawn is not, nor are patches of the floor.
+    """
     lines = [
         line
-        for robot in dict.fromkeys(scenario.robot_models)
+        for robot in dict.fromkeys(_disturbed_robots(scenario))
         for line in _warnings_for(
             scenario.trajectory,
             robot,
@@ -463,12 +467,43 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             scenario.start_spacing_mm,
         )
     ]
+    if scenario.observation == "sensor":
+        lines += sensor_warnings(
+            scenario.trajectory,
+            scenario.horizon_s,
+            robots=scenario.robot_count,
+            time_gap_s=scenario.time_gap_s,
+            start_spacing_mm=scenario.start_spacing_mm,
+        )
     if scenario.estimator == "ekf" and controller(scenario.residual_base).limits.cancel_slip:
         lines.append(
             f"residual_base {scenario.residual_base!r} takes the estimated slip off its commands, and "
             "estimator 'ekf' estimates none; it is made for 'ekf-slip'"
         )
     return list(dict.fromkeys(lines))
+
+
+def scenario_notes(scenario: Scenario) -> list[str]:
+    """What is worth knowing of the scenario and no fault of it, a line each."""
+    note = start_note(scenario.trajectory, _disturbed_robots(scenario)[0])
+    return [] if note is None else [note]
+
+
+def _disturbed_robots(scenario: Scenario) -> list[RobotParameters]:
+    """Every robot with the limits that a constant disturbance leaves it."""
+    told = scenario.disturbance
+    grip, gain_l, gain_r = (
+        told.constant(path)
+        for path in (
+            "tyre.friction_scale",
+            "actuator.torque_gain_l",
+            "actuator.torque_gain_r",
+        )
+    )
+    gain = min((one for one in (gain_l, gain_r) if one is not None), default=1.0)
+    return [
+        disturbed(robot, 1.0 if grip is None else grip, gain) for robot in scenario.robot_models
+    ]
 
 
 def _merged(old: Any, new: Any) -> Any:
