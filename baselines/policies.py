@@ -12,7 +12,7 @@ from baselines.card import WEIGHTS
 from baselines.classical import FeedbackLinearisation, PurePursuit
 from baselines.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.reference import ReferencePolicy
-from tlf_env.onboard.parts import Policy, load_part
+from tlf_env.onboard.parts import Policy, load_part, make_part
 from tlf_env.onboard.tracking import CONTROLLERS
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import tracking_entries
@@ -146,17 +146,14 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     if name.endswith(WEIGHTS) or name in shipped_policies():
         return load_policy(name)
     head, _, tail = name.partition(":")
-    if head == "reference":
+    if head == "reference" and name != "reference:":
         fits(name, scenario, action="twist", observation="tracking")
         return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
     if head in CLASSICAL and not tail:
         fits(name, scenario, action="twist", observation="tracking")
         return CLASSICAL[head](scenario.preview_s)
     if tail:
-        policy = load_part(name)()
-        if not hasattr(policy, "predict"):
-            raise ValueError(f"policy {name!r} has no predict()")
-        return policy
+        return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])
     raise ValueError(
         f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, FILE.zip"

@@ -14,7 +14,7 @@ import numpy as np
 
 from tlf_env.numerics.files import atomic
 from tlf_env.numerics.philox import checked_seed
-from tlf_env.onboard.parts import Factory, Policy
+from tlf_env.onboard.parts import Factory, Policy, predicted
 from tlf_env.physics.state import Motion
 from tlf_env.task.arrays import Arrays, Info
 from tlf_env.task.batch import BatchPlant
@@ -124,12 +124,18 @@ def run_policy(
         Factories of the parts that the scenario names, where they are at hand as objects.
     progress
         Called with the steps done and the steps in all.
+
+    Raises
+    ------
+    ValueError
+        naming the policy, if its ``predict`` returns no pair of actions in their shape and a state;
+        naming part and factory, for a part that cannot be made.
     """
     formation = Formation(scenario.model_copy(update={"end_on": ()}), parts)
     formation.reset(checked_seed(seed))
     a, steps = formation.arrays, scenario.horizon_steps
     tape = _Tape(a, steps)
-    driver = _Driver(policy, scenario, a)
+    driver = _Driver(policy, scenario, a, name)
     for k in range(1, steps + 1):
         a.actions[:] = driver.act()
         formation.step()
@@ -151,7 +157,7 @@ def run_seeds(
     plant.reset(list(seeds))
     a, steps = plant.arrays, scenario.horizon_steps
     tape = _Tape(a, steps)
-    driver = _Driver(policy, scenario, a)
+    driver = _Driver(policy, scenario, a, name)
     try:
         actions = driver.act()
     except ValueError:
@@ -172,8 +178,8 @@ def run_seeds(
 class _Driver:
     """A policy and what it remembers of an episode."""
 
-    def __init__(self, policy: Policy, scenario: Scenario, a: Arrays) -> None:
-        self._policy = policy
+    def __init__(self, policy: Policy, scenario: Scenario, a: Arrays, name: str) -> None:
+        self._policy, self._name = policy, name
         self._seen = a.sensor_observations if scenario.observation == "sensor" else a.observations
         self._shape = a.actions.shape
         self._state: Any = None
@@ -182,9 +188,11 @@ class _Driver:
     def act(self) -> np.ndarray:
         """Actions for all robots of all lanes."""
         rows = self._seen.reshape(len(self._start), -1).copy()
-        actions, self._state = self._policy.predict(rows, self._state, self._start, True)
+        answer = self._policy.predict(rows, self._state, self._start, True)
+        shape = (len(rows), self._shape[2])
+        actions, self._state = predicted(answer, shape, f"policy {self._name!r}")
         self._start = np.zeros_like(self._start)
-        return checked_actions(actions, (len(rows), self._shape[2])).reshape(self._shape)
+        return actions.reshape(self._shape)
 
 
 class _Tape:
@@ -225,20 +233,6 @@ class _Tape:
             lost_at_s=self._lost_at_s[lane],
             touched_at_s=self._touched_at_s[lane],
         )
-
-
-def checked_actions(actions: Any, shape: tuple[int, ...]) -> np.ndarray:
-    """A policy's actions for all robots.
-
-    Raises
-    ------
-    ValueError
-        if their shape is wrong.
-    """
-    array = np.asarray(actions, dtype=np.float64)
-    if array.shape != shape:
-        raise ValueError(f"the policy's actions must have the shape {shape}, got {array.shape}")
-    return array
 
 
 def _with_functionals(rows: dict[str, np.ndarray], period_s: float) -> dict[str, np.ndarray]:

@@ -145,10 +145,14 @@ class FormationVecEnv(VecEnv):
         if actions is None:
             raise RuntimeError("call step_async() before step_wait()")
         self._actions = None
-        if actions.shape != (self.num_envs, ACTION_SIZE) or not np.isfinite(actions).all():
+        if (
+            actions.shape != (self.num_envs, ACTION_SIZE)
+            or actions.dtype.kind not in "biuf"
+            or not np.isfinite(actions).all()
+        ):
             raise ValueError(
                 f"actions must be {(self.num_envs, ACTION_SIZE)} finite numbers, got the shape "
-                f"{actions.shape}"
+                f"{actions.shape} of {actions.dtype}"
             )
         for plant, rows in self._parts(actions):
             plant.step(rows.reshape(plant.arrays.actions.shape))

@@ -202,7 +202,7 @@ def test_an_unknown_learner_is_named(learner: Any) -> None:
         ("no_such_module:Policy", "cannot import 'no_such_module'"),
         ("baselines:NoSuchPolicy", "module 'baselines' has no 'NoSuchPolicy'"),
         ("math:pi", "'math:pi' is not callable"),
-        ("builtins:dict", r"others {} has no predict\(\)"),
+        ("builtins:dict", r"others 'builtins:dict' has no predict\(\): factory\(\) made dict"),
     ],
 )
 def test_impossible_others_are_named(others: Any, message: str) -> None:

@@ -386,6 +386,9 @@ BAD = {
     "words": ["fast", "left"],
     "two nones": [None, None],
     "ragged": [[1.0], [1.0, 2.0]],
+    "numbers in words": ["0.5", "0.5"],
+    "an array of words": np.array(["0.5", "0.5"]),
+    "complex": np.array([0.5, 0.5 + 1j]),
 }
 
 

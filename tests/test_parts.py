@@ -369,6 +369,91 @@ def test_a_part_that_is_not_there_is_named(role: str, path: str, message: str) -
         tlf_env.parallel_env("infinity", **{role: path})
 
 
+BROKEN = {
+    "syntax_here": ("def broken(:\n", "SyntaxError"),
+    "raises_here": ("raise RuntimeError('not\\ntoday')\n", "RuntimeError: not today"),
+    "attribute_here": ("import math\nmath.no_such\n", "AttributeError: .*no_such"),
+    "leaves_here": ("import sys\nsys.exit(0)\n", "SystemExit: 0"),
+}
+
+
+@pytest.mark.parametrize(("module", "text", "message"), [(k, *v) for k, v in BROKEN.items()])
+def test_a_module_that_cannot_be_imported_is_told_in_one_line(
+    module: str, text: str, message: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    (tmp_path / f"{module}.py").write_text(text)
+    monkeypatch.chdir(tmp_path)
+    line = rf"^cannot import '{module}' of '{module}:Part': {message}[^\n]*$"
+    with pytest.raises(ValueError, match=line):
+        tlf_env.parallel_env("infinity", estimator=f"{module}:Part")
+    assert str(tmp_path) not in sys.path
+
+
+class NoReset:
+    def __init__(self, robot: RobotParameters, period_s: float) -> None:
+        pass
+
+    def update(self, *_: Any) -> Any:
+        return np.zeros(3)
+
+    torque = update
+
+
+class OtherReset(Still):
+    def reset(self, pose: Any, speed: Any) -> None:
+        pass
+
+
+class Keyworded(Still):
+    def __init__(self, robot: RobotParameters, period_s: float, *, gain: float) -> None:
+        super().__init__(robot, period_s)
+
+
+def given_a_class(robot: RobotParameters, period_s: float) -> type:
+    return Still
+
+
+WANTED = {
+    "estimator": r"reset\(pose\) and update\(steps_rad, fix_mm\)",
+    "wheel_loop": r"reset\(\) and torque\(wanted_rad_s, measured_rad_s\)",
+    "observer": r"reset\(pose\) and update\(message, t_s\)",
+}
+
+
+@pytest.mark.parametrize("role", METHODS)
+@pytest.mark.parametrize("path", ["os:getcwd", "builtins:dict", f"{HERE}:Keyworded", "json:loads"])
+def test_a_factory_that_does_not_take_robot_and_period_is_named(role: str, path: str) -> None:
+    env = tlf_env.parallel_env("infinity", **{role: path})
+    wanted = rf"^{role} '{path}' cannot be made by factory\(robot, period_s\): [^\n]+$"
+    with pytest.raises(ValueError, match=wanted):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize("role", METHODS)
+@pytest.mark.parametrize("part", ["NoReset", "given_a_class"])
+def test_a_part_without_a_method_is_named_with_what_it_needs(role: str, part: str) -> None:
+    env = tlf_env.parallel_env("infinity", **{role: f"{HERE}:{part}"})
+    with pytest.raises(ValueError, match=rf"^{role} '{HERE}:{part}' .*{WANTED[role]}$"):
+        env.reset(seed=0)
+
+
+@pytest.mark.parametrize("role", METHODS)
+def test_a_method_that_takes_something_else_is_named(role: str) -> None:
+    env = tlf_env.parallel_env("infinity", **{role: OtherReset})
+    with pytest.raises(ValueError, match=rf"^{role} .*OtherReset': reset\(.*cannot be called as"):
+        env.reset(seed=0)
+
+
+def test_an_error_inside_a_part_keeps_its_kind() -> None:
+    class Raises(Still):
+        def update(self, *_: Any) -> Any:
+            raise KeyError("mine")
+
+    env = tlf_env.parallel_env("infinity", estimator=importable(Raises))
+    with pytest.raises(KeyError, match="mine"):
+        drive(env, 0.1)
+
+
 def test_the_kinematic_plant_has_no_wheel_loop() -> None:
     with pytest.raises(ValueError, match="'kinematic' has no torques"):
         tlf_env.parallel_env("infinity", plant="kinematic", wheel_loop=Still)

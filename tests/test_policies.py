@@ -1,13 +1,18 @@
 """Policies by name: what is made, what is refused and in which words."""
 
+import json
+import sys
+
 import numpy as np
 import pytest
 
 from baselines.bench import policy_hash
 from baselines.controllers import load_controller
 from baselines.policies import enter, make_policy, overrides_told, policy_names
-from baselines.run import run_policy
+from baselines.run import run_policy, run_seeds
 from baselines.stack import StackPolicy
+from tlf_env.cli import main
+from tlf_env.envs.single import FormationEnv
 from tlf_env.onboard.tracking import controller
 from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.scenario import load_scenario
@@ -25,6 +30,36 @@ class Odd:
         return np.zeros((len(observation), 3)), state
 
 nothing = object
+
+class Forgets:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        self.seen = observation
+
+class ActionsAlone:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2))
+
+class Words:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return [["0.5", "0.5"]] * len(observation), state
+
+class Complex:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2), complex), state
+
+class Three:
+    def predict(self, observation, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(observation), 2)), state, None
+
+class Short:
+    def predict(self, observation):
+        return np.zeros((len(observation), 2)), None
+
+def needs(gain):
+    return Still()
+
+def a_class():
+    return Still
 """
 
 
@@ -41,7 +76,9 @@ def test_every_name_makes_a_policy_that_drives(name):
     assert np.isfinite(record["x_mm"]).all()
 
 
-@pytest.mark.parametrize("name", ["", "no_such", "reference:no_such", "pure_pursuit:tuned"])
+@pytest.mark.parametrize(
+    "name", ["", "no_such", "reference:no_such", "reference:", "pure_pursuit:tuned"]
+)
 def test_an_unknown_name_is_told(name):
     with pytest.raises(ValueError, match=r"^[^\n]+$"):
         make_policy(name, SCENARIO)
@@ -204,6 +241,87 @@ def test_a_policy_of_ones_own_must_predict_actions_of_the_right_shape():
         make_policy("own_policies:nothing", SCENARIO)
     with pytest.raises(ValueError, match=r"must have the shape \(3, 2\), got \(3, 3\)"):
         run_policy(SCENARIO, make_policy("own_policies:Odd", SCENARIO))
+
+
+@pytest.mark.usefixtures("own_module")
+@pytest.mark.parametrize(
+    ("name", "message"),
+    [
+        ("needs", r"cannot be made by factory\(\): .*'gain'"),
+        ("a_class", r"has no predict\(\): factory\(\) made the class Still"),
+        ("Short", r"predict\(observation\) cannot be called as predict\(observation, state, "),
+    ],
+)
+def test_a_factory_that_makes_no_policy_is_told_in_one_line(name, message):
+    with pytest.raises(ValueError, match=rf"^policy 'own_policies:{name}'[^\n]*{message}"):
+        make_policy(f"own_policies:{name}", SCENARIO)
+
+
+PREDICTS = {
+    "Forgets": r"must return a pair, \(actions, state\), got NoneType",
+    "ActionsAlone": r"must return a pair, \(actions, state\), got ndarray",
+    "Three": r"must return a pair, \(actions, state\), got tuple of 3",
+    "Words": r"must be real numbers in the shape \(2, 2\)",
+    "Complex": r"must be real numbers in the shape \(2, 2\)",
+}
+
+
+@pytest.mark.usefixtures("own_module")
+@pytest.mark.parametrize(("name", "message"), PREDICTS.items())
+def test_a_prediction_that_is_no_pair_of_actions_and_state_is_told(name, message):
+    """With two robots: two rows of actions alone could pass for a pair."""
+    scenario = load_scenario(SCENARIO, robots=2)
+    policy = make_policy(f"own_policies:{name}", scenario)
+    with pytest.raises(ValueError, match=rf"^policy 'mine': [^\n]*{message}[^\n]*$"):
+        run_policy(scenario, policy, name="mine")
+    with pytest.raises(ValueError, match=rf"^policy 'mine': [^\n]*{message}[^\n]*$"):
+        list(run_seeds(load_scenario(scenario, plant="batch"), policy, [0], name="mine"))
+
+
+@pytest.mark.usefixtures("own_module")
+@pytest.mark.parametrize(("name", "message"), PREDICTS.items())
+def test_what_drives_the_others_is_checked_likewise(name, message):
+    env = FormationEnv(SCENARIO, others=f"own_policies:{name}")
+    env.reset(seed=0)
+    with pytest.raises(ValueError, match=rf"^others: [^\n]*{message}[^\n]*$"):
+        env.step(np.zeros(2, np.float32))
+
+
+@pytest.mark.usefixtures("own_module")
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--estimator", "os:getcwd"],
+        ["--wheel-loop", "os:getcwd"],
+        ["--observer", "builtins:dict"],
+        ["--policy", "own_policies:needs"],
+        ["--policy", "own_policies:ActionsAlone"],
+        ["--policy", "reference:"],
+    ],
+)
+def test_the_command_line_tells_a_wrong_part_in_one_line(words, monkeypatch, capsys, tmp_path):
+    out = ["--out", str(tmp_path / "out"), "--no-figures", "--horizon-s", "0.2"]
+    monkeypatch.setattr(sys, "argv", ["tlf", "run", "stop_and_go", *words, *out])
+    with pytest.raises(SystemExit) as left:
+        main()
+    assert left.value.code == 2
+    last = capsys.readouterr().err.strip().splitlines()[-1]
+    assert last.startswith("tlf: ")
+    assert words[1] in last
+
+
+@pytest.mark.parametrize("as_json", [[], ["--json"]])
+def test_a_run_notes_the_start_at_speed_once_and_beside_the_result(
+    as_json, monkeypatch, capsys, tmp_path
+):
+    words = ["infinity", "--no-figures", "--horizon-s", "0.2", "--out", str(tmp_path), *as_json]
+    monkeypatch.setattr(sys, "argv", ["tlf", "run", *words])
+    main()
+    told = capsys.readouterr()
+    assert told.err.count("tlf: note: the reference starts at 559 mm/s") == 1
+    assert "559" not in told.out
+    if as_json:
+        json.loads(told.out)
 
 
 def test_a_zip_is_loaded_only_on_trust(tmp_path):

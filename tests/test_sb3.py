@@ -94,6 +94,8 @@ def test_the_interface_of_vec_env():
         env.step(np.full((6, 2), np.nan))
     with pytest.raises(ValueError, match=r"\(6, 2\) finite numbers"):
         env.step(np.zeros((5, 2)))
+    with pytest.raises(ValueError, match=r"\(6, 2\) finite numbers"):
+        env.step(np.full((6, 2), "0.5"))
 
 
 def weights(seed: int) -> list[np.ndarray]:

@@ -183,12 +183,22 @@ def test_what_does_not_exist_is_one_clear_error(change, says):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.parametrize("action", [np.zeros((4, 2)), np.full((5, 2), np.nan)])
+@pytest.mark.parametrize(
+    "action",
+    [
+        np.zeros((4, 2)),
+        np.full((5, 2), np.nan),
+        np.full((5, 2), "0.5"),
+        np.full((5, 2), 0.5j),
+        None,
+        [[0.0, 0.0], [0.0]],
+    ],
+)
 def test_a_wrong_action_changes_nothing(action):
     env, other = vector(), vector()
     env.reset(seed=0)
     other.reset(seed=0)
-    with pytest.raises(ValueError, match=r"shape|formation 0, robot_1"):
+    with pytest.raises(ValueError, match=r"shape|formation 0, robot_1|real numbers"):
         env.step(action)
     good = np.zeros((5, 2), np.float32)
     assert np.array_equal(env.step(good)[0], other.step(good)[0])

@@ -18,7 +18,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 
 from tlf_env.envs.spec import documented
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
-from tlf_env.onboard.parts import Factory, part_name
+from tlf_env.onboard.parts import Factory, part_name, real_numbers
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.arrays import END_REASONS, Info, State
 from tlf_env.task.channels import PATHS
@@ -229,18 +229,17 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                 action = actions[agent]
             except KeyError:
                 self._complain(actions)
-            try:
-                shape = np.shape(action)
-                if shape == (ACTION_SIZE,):
-                    buffer[i] = action
-                    continue
-            except (TypeError, ValueError) as error:
+            numbers = real_numbers(action)
+            if numbers is None:
                 raise ValueError(
-                    f"{agent}: the action must be {ACTION_SIZE} numbers, got {action!r}"
-                ) from error
-            raise ValueError(
-                f"{agent}: the action must have the shape ({ACTION_SIZE},), got {shape}"
-            )
+                    f"{agent}: the action must be {ACTION_SIZE} numbers, got "
+                    f"{' '.join(repr(action).split())}"
+                )
+            if numbers.shape != (ACTION_SIZE,):
+                raise ValueError(
+                    f"{agent}: the action must have the shape ({ACTION_SIZE},), got {numbers.shape}"
+                )
+            buffer[i] = numbers
 
     def _complain(self, actions: dict[Agent, np.ndarray]) -> None:
         unknown = [agent for agent in actions if agent not in self.agents]

@@ -11,7 +11,7 @@ import numpy as np
 
 from tlf_env.envs.parallel import RENDER_MODES, FormationParallelEnv
 from tlf_env.envs.spec import documented
-from tlf_env.onboard.parts import Policy, load_part
+from tlf_env.onboard.parts import Policy, load_part, make_part, predicted
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE, TWIST
 from tlf_env.task.scenario import Scenario
 
@@ -91,7 +91,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
                 raise ValueError(
                     f"others {others!r} is neither {BY_REFERENCE!r} nor 'module:factory' nor an object"
                 )
-            driver = load_part(others)()
+            driver = make_part("others", others, load_part(others))
         if isinstance(driver, type) or not hasattr(driver, "predict"):
             raise ValueError(f"others {driver!r} has no predict()")
         return cast(Policy, driver)
@@ -117,7 +117,8 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises
         ------
         ValueError
-            for a wrongly shaped or non-finite action; the episode stands as it was.
+            for a wrongly shaped or non-finite action, also of ``others``; the episode stands as it
+            was.
         RuntimeError
             before the first reset, or after the end of the episode.
         """
@@ -132,9 +133,8 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if self._driver is None or not self._rest:
             return dict(self._still)  # the drivers put the reference's action in their place
         seen = self.formation_env.formation.arrays.observations[0, self._rest]
-        actions, self._driver_state = self._driver.predict(
-            seen, self._driver_state, self._driver_start.copy(), True
-        )
+        answer = self._driver.predict(seen, self._driver_state, self._driver_start.copy(), True)
+        actions, self._driver_state = predicted(answer, (len(seen), ACTION_SIZE), "others")
         self._driver_start[:] = False
         return dict(zip(self._still, actions, strict=True))
 

@@ -13,6 +13,7 @@ from gymnasium.vector.utils import batch_space
 
 from tlf_env.envs.parallel import start_options
 from tlf_env.envs.single import BY_REFERENCE
+from tlf_env.onboard.parts import real_numbers
 from tlf_env.task import judging
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE
 from tlf_env.task.arrays import END_REASONS, Info
@@ -176,7 +177,11 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         RuntimeError
             before the first reset, or in mode ``Disabled`` if a formation ended and was not reset.
         """
-        given = np.asarray(actions)
+        given = real_numbers(actions)
+        if given is None:
+            raise ValueError(
+                f"actions must be real numbers, got {' '.join(repr(actions).split()):.60}"
+            )
         if given.shape != self._actions[:, self._robot].shape:
             raise ValueError(
                 f"actions must have the shape {self._actions[:, self._robot].shape}, got {given.shape}"

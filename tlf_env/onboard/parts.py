@@ -8,6 +8,7 @@ the string ``"module:factory"``. It is called as ``factory(robot, period_s)`` wi
 from __future__ import annotations
 
 import importlib
+import inspect
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -19,6 +20,14 @@ from tlf_env.onboard.observer import Message, Reference
 
 PART_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_<][\w.<>]*$"  # <locals>, <lambda>: given as objects
 Factory = Callable[..., Any]
+
+# What each role calls, and with what.
+METHODS = {
+    "estimator": {"reset": ("pose",), "update": ("steps_rad", "fix_mm")},
+    "wheel_loop": {"reset": (), "torque": ("wanted_rad_s", "measured_rad_s")},
+    "observer": {"reset": ("pose",), "update": ("message", "t_s")},
+}
+PREDICT = {"predict": ("observation", "state", "episode_start", "deterministic")}
 
 
 class Estimator(Protocol):
@@ -73,7 +82,8 @@ def load_part(path: str) -> Factory:
     Raises
     ------
     ValueError
-        if there is no such module or name.
+        in one line, if there is no such module or name, or the module cannot be imported, whatever
+        it raises.
     """
     module_name, _, name = path.partition(":")
     here = str(Path.cwd())
@@ -82,23 +92,107 @@ def load_part(path: str) -> Factory:
         sys.path.insert(0, here)
     try:
         target: Any = importlib.import_module(module_name)
+    except (Exception, SystemExit) as error:  # the module is the user's: it may raise anything
+        kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
+        why = " ".join(f"{kind}{error}".split())
+        raise ValueError(f"cannot import {module_name!r} of {path!r}: {why}") from error
+    finally:
+        if added and here in sys.path:
+            sys.path.remove(here)
+    try:
         for part in name.split("."):
             target = getattr(target, part)
-    except ImportError as error:
-        raise ValueError(f"cannot import {module_name!r} of {path!r}: {error}") from error
     except AttributeError as error:
         raise ValueError(f"module {module_name!r} has no {name!r}") from error
-    finally:
-        if added:
-            sys.path.remove(here)
     if not callable(target):
         raise ValueError(f"{path!r} is not callable; it must be a factory")
     return target
 
 
+def make_part(role: str, name: str, factory: Factory, *given: Any) -> Any:
+    """A part of a role, ``factory(*given)``: a robot and a period (s), or nothing for a policy.
+
+    Parameters
+    ----------
+    role
+        ``estimator``, ``wheel_loop`` or ``observer``; anything else (``policy``, ``others``) has
+        SB3's ``predict``.
+    name
+        The factory's, for errors.
+
+    Raises
+    ------
+    ValueError
+        in one line that names role, factory and what is wanted, if the factory does not take what it
+        is called with (any TypeError of it counts), or what it makes lacks a method or has one that
+        cannot be called as it will be.
+    """
+    what = f"{role} {name!r}"
+    call = "factory(robot, period_s)" if given else "factory()"
+    try:
+        part = factory(*given)
+    except TypeError as error:
+        why = " ".join(str(error).split())
+        raise ValueError(f"{what} cannot be made by {call}: {why}") from error
+    methods = METHODS.get(role, PREDICT)
+    wanted = " and ".join(f"{one}({', '.join(names)})" for one, names in methods.items())
+    for method, names in methods.items():
+        found = getattr(part, method, None)
+        if isinstance(part, type) or not callable(found):
+            made = f"the class {part.__name__}" if isinstance(part, type) else type(part).__name__
+            raise ValueError(
+                f"{what} has no {method}(): {call} made {made}, and what it makes needs {wanted}"
+            )
+        try:
+            signature = inspect.signature(found)
+        except (TypeError, ValueError):  # built-in: it does not tell
+            continue
+        try:
+            signature.bind(*names)
+        except TypeError as error:
+            raise ValueError(
+                f"{what}: {method}{signature} cannot be called as {method}({', '.join(names)}): "
+                f"{error}"
+            ) from error
+    return part
+
+
 def part_name(factory: Factory) -> str:
     """``module:name`` of a factory, for the record."""
     return f"{factory.__module__}:{getattr(factory, '__qualname__', type(factory).__qualname__)}"
+
+
+def real_numbers(value: Any) -> np.ndarray | None:
+    """The value as float64, or None where it is not made of real numbers: text and complex are not."""
+    try:
+        array = np.asarray(value)
+        return array.astype(np.float64) if array.dtype.kind in "biuf" else None
+    except (TypeError, ValueError):
+        return None
+
+
+def predicted(answer: Any, shape: tuple[int, ...], who: str) -> tuple[np.ndarray, Any]:
+    """What a policy's ``predict`` returned: the actions, float64 in ``shape``, and its next state.
+
+    Raises
+    ------
+    ValueError
+        naming the policy, if it is no pair, or the actions are no real numbers of that shape.
+    """
+    if not isinstance(answer, tuple) or len(answer) != 2:
+        size = f" of {len(answer)}" if isinstance(answer, tuple) else ""
+        raise ValueError(
+            f"{who}: predict() must return a pair, (actions, state), got {type(answer).__name__}{size}"
+        )
+    actions = real_numbers(answer[0])
+    if actions is None:
+        raise ValueError(
+            f"{who}: the actions must be real numbers in the shape {shape}, got "
+            f"{' '.join(repr(answer[0]).split()):.60}"
+        )
+    if actions.shape != shape:
+        raise ValueError(f"{who}: the actions must have the shape {shape}, got {actions.shape}")
+    return actions, answer[1]
 
 
 def finite(value: Any, size: int, what: str) -> np.ndarray:

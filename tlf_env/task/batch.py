@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
+from tlf_env.onboard.parts import real_numbers
 from tlf_env.task import drivers, judging
 from tlf_env.task.arrays import Arrays, make_arrays, make_variants
 from tlf_env.task.excerpt import Excerpt, empty_excerpt
@@ -162,7 +163,12 @@ class BatchPlant:
             if a formation was never reset, or is at its horizon.
         """
         a, s = self.arrays, self._settings
-        given = np.asarray(actions, dtype=np.float64)
+        given = real_numbers(actions)
+        if given is None:
+            raise ValueError(
+                f"actions must be real numbers in the shape {a.actions.shape}, got "
+                f"{' '.join(repr(actions).split()):.60}"
+            )
         if given.shape != a.actions.shape:
             raise ValueError(f"actions must have the shape {a.actions.shape}, got {given.shape}")
         if not np.isfinite(given).all():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from tlf_env.onboard.parts import Factory, finite, load_part
+from tlf_env.onboard.parts import Factory, finite, load_part, make_part
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
 from tlf_env.task import drivers
 from tlf_env.task.actions import TORQUE
@@ -36,6 +36,7 @@ class Parts:
 
     def __init__(self, factories: Mapping[str, Factory], scenario: Scenario) -> None:
         self._factories = factories
+        self._names = scenario.part_paths
         self._robots = scenario.robot_models
         self._periods = {
             "estimator": scenario.physics_period_s,
@@ -45,9 +46,18 @@ class Parts:
         self._made: dict[str, list[Any]] = {}
 
     def reset(self, a: Arrays, s: Settings) -> None:
-        """Make all parts anew and start them; observers run ahead by the preview."""
+        """Make all parts anew and start them; observers run ahead by the preview.
+
+        Raises
+        ------
+        ValueError
+            for a factory that makes no part of its role.
+        """
         self._made = {
-            role: [factory(robot, self._periods[role]) for robot in self._robots]
+            role: [
+                make_part(role, self._names[role], factory, robot, self._periods[role])
+                for robot in self._robots
+            ]
             for role, factory in self._factories.items()
         }
         for estimator, pose in zip(self._of("estimator"), a.starts[:, :, 0].T, strict=False):
