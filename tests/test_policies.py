@@ -310,6 +310,20 @@ def test_the_command_line_tells_a_wrong_part_in_one_line(words, monkeypatch, cap
     assert words[1] in last
 
 
+def test_a_run_warns_of_the_scenario_that_the_policy_asks_for(monkeypatch, capsys, tmp_path):
+    (tmp_path / "asking.py").write_text(
+        MODULE + "\nclass Sensing(Still):\n    scenario_overrides = {'observation': 'sensor'}\n"
+    )
+    (tmp_path / "wide.yaml").write_text(
+        "trajectory: {type: circle, radius_mm: 1000, speed_mm_s: 100, centre_x_mm: 20000}\n"
+    )
+    monkeypatch.chdir(tmp_path)
+    words = ["run", "wide.yaml", "--policy", "asking:Sensing", "--no-figures", "--horizon-s", "0.2"]
+    monkeypatch.setattr(sys, "argv", ["tlf", *words])
+    main()
+    assert "tlf: warning: t = 0 s: robot_0 starts at (21000, 0) mm" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("as_json", [[], ["--json"]])
 def test_a_run_notes_the_start_at_speed_once_and_beside_the_result(
     as_json, monkeypatch, capsys, tmp_path

@@ -117,16 +117,16 @@ def run(
         control_period_s=control_period_s,
         horizon_s=horizon_s,
     )
-    for line in scenario_warnings(chosen):
-        notes.print(f"tlf: warning: {line}", markup=False, soft_wrap=True)
-    for line in scenario_notes(chosen):
-        notes.print(f"tlf: note: {line}", markup=False, soft_wrap=True)
     checked_seed(seed)
     name = named_policy(policy, gains)
     driver, chosen, overrides = enter(name, chosen, trust=trust)
     if overrides:
         told = overrides_told(overrides)
         notes.print(f"tlf: note: as {name} asks: {', '.join(told)}", markup=False, soft_wrap=True)
+    for line in scenario_warnings(chosen):
+        notes.print(f"tlf: warning: {line}", markup=False, soft_wrap=True)
+    for line in scenario_notes(chosen):
+        notes.print(f"tlf: note: {line}", markup=False, soft_wrap=True)
     folder = writable_folder(out or Path("results") / chosen.name)
     warn_of_compiling()
     with progress_bar(f"{chosen.name}, {name}") as update:
