@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
@@ -24,16 +23,13 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullLocator
 
 from baselines.run import Record
+from tlf_env.envs.looks import CASTOR_WIDTH_MM, DRIVE_WHEEL_WIDTH_MM, NOSE, robot_colours
 from tlf_env.numerics.files import atomic
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 
 DPI = 150
 METADATA: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
-# Okabe and Ito's colours but yellow, which is lost on white; neighbours differ in luminance too.
-FEW_COLOURS = ("#000000", "#E69F00", "#0072B2", "#56B4E9", "#D55E00", "#009E73", "#CC79A7")
-MANY_COLOURS = colormaps["viridis"]  # from dark to light along the formation
-LIGHTEST = 0.92  # of the map: its end is lost on white
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 MARKERS_PER_LINE = 7
 COMMAND_COLOUR, ACTUAL_COLOUR = "#E69F00", "#0072B2"
@@ -49,7 +45,6 @@ MOST_SHOWN = 24  # rows of robots, and entries of a legend
 SNAPSHOTS = 4  # times at which the robots are drawn, at most
 SNAPSHOT_ROOM = 1.5  # between robots of different times, in outline diameters
 FADED = 0.5
-DRIVE_WHEEL_WIDTH_MM, CASTOR_WIDTH_MM = 24.0, 16.0  # of the picture; the model's are lines
 
 
 def write_figures(
@@ -228,6 +223,11 @@ def thinned(t_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return t_s[keep], values[keep]
 
 
+def hex_colour(i: int, count: int) -> str:
+    """The colour of number ``i`` of ``count`` robots or policies, as ``#rrggbb``; the renderer's."""
+    return "#{:02x}{:02x}{:02x}".format(*robot_colours(count)[i])
+
+
 def unbroken(values: np.ndarray, jump: float) -> np.ndarray:
     """Values with NaN after each jump beyond ``jump``, so that no line is drawn across."""
     return np.where(np.abs(np.diff(values, prepend=values[:1])) > jump, np.nan, values)
@@ -247,13 +247,12 @@ def body_polygons(record: Record, k: int, i: int) -> list[np.ndarray]:
     front_mm = robot.outline_radius_mm - robot.outline_offset_mm
     tyre = _rectangle(DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm)
     castor = _rectangle(CASTOR_WIDTH_MM, 2 * robot.castor_radius_mm)
-    nose = front_mm * np.array([[-0.35, 0.35], [0.35, 0.35], [0.0, 0.95]])
     pivot = c - robot.castor_pivot_mm * body[1]
     return [
         c - half_mm * body[0] + tyre @ body,
         c + half_mm * body[0] + tyre @ body,
         pivot + (castor - (0, robot.castor_trail_mm)) @ fork,
-        c + nose @ body,
+        c + front_mm * np.array(NOSE) @ body,
     ]
 
 
@@ -321,10 +320,8 @@ def _rows(
     return figure, dict(zip(robots.tolist(), grid, strict=True))
 
 
-def _colour(record: Record, i: int) -> Any:
-    if record.robots <= len(FEW_COLOURS):
-        return FEW_COLOURS[i]
-    return MANY_COLOURS(LIGHTEST * i / (record.robots - 1))
+def _colour(record: Record, i: int) -> str:
+    return hex_colour(i, record.robots)
 
 
 def _robot_line(
@@ -486,7 +483,11 @@ def _plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
     every = max(1, len(record.t_s) // MOST_POINTS)
     axes.plot(*record.leader[::every].T, color="0.8", lw=5.0, zorder=1, label="leader's reference")
     for i in range(n):  # later robots on top and thinner, so that paths that coincide all show
-        style = {"color": _colour(record, i), "marker": MARKERS[i % len(MARKERS)], "mfc": "white"}
+        style: dict[str, Any] = {
+            "color": _colour(record, i),
+            "marker": MARKERS[i % len(MARKERS)],
+            "mfc": "white",
+        }
         path = _places(record)[::every, i]
         width = 1.0 + 2.5 * (n - 1 - i) / max(n - 1, 1)
         axes.plot(*path.T, **style, markevery=[0], lw=width, zorder=2, label=f"robot {i}")

@@ -14,7 +14,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from tlf_env.envs.rendering import ALARM, FLOOR, Renderer, Scene, robot_colours, round_length
+from tlf_env.envs.looks import NOSE, robot_colours
+from tlf_env.envs.rendering import ALARM, FLOOR, Renderer, Scene, round_length
 from tlf_env.physics.parameters import RobotParameters
 
 pygame = pytest.importorskip("pygame")
@@ -233,6 +234,34 @@ def test_colours_differ() -> None:
     for robots in (1, 3, 7, 8, 20):
         assert len(set(robot_colours(robots))) == robots
         assert ALARM not in robot_colours(robots)
+
+
+@pytest.mark.parametrize("robots", [3, 9])
+def test_a_robot_has_the_colour_that_it_has_in_the_figures(robots: int) -> None:
+    figures = pytest.importorskip("baselines.figures")
+    from matplotlib.colors import to_rgb
+
+    from baselines import ReferencePolicy
+    from baselines.run import run_policy
+    from tlf_env import load_scenario
+
+    run = run_policy(load_scenario("flower", robots=robots, horizon_s=0.02), ReferencePolicy())
+    labelled = {line.get_label(): line for line in figures.paths(run).axes[0].lines}
+    x_mm = 3000.0 - 750.0 * np.arange(robots)
+    renderer = make_renderer(robots, close_up=None, size_px=(1920, 1440))
+    everyone = frame(renderer, make_scene(robots, x_mm=x_mm))
+    for i in range(robots):
+        colour = tuple(round(255 * c) for c in to_rgb(labelled[f"robot {i}"].get_color()))
+        others = np.where(np.arange(robots) == i, np.nan, x_mm)
+        without = frame(renderer, make_scene(robots, x_mm=others))
+        assert count(everyone, colour, 0) > count(without, colour, 0) + 20
+
+
+def test_a_nose_cannot_be_taken_for_pointing_elsewhere() -> None:
+    left, right, tip = np.array(NOSE)
+    base, sides = math.dist(left, right), (math.dist(left, tip), math.dist(right, tip))
+    assert sides[0] == pytest.approx(sides[1])
+    assert sides[0] > 1.8 * base
 
 
 def test_round_lengths() -> None:

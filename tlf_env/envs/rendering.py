@@ -12,13 +12,18 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tlf_env.envs.looks import (
+    CASTOR_WIDTH_MM,
+    DRIVE_WHEEL_WIDTH_MM,
+    NOSE,
+    Colour,
+    robot_colours,
+)
 from tlf_env.onboard.observer import Reference
 from tlf_env.physics.parameters import RobotParameters
 from tlf_env.physics.state import Contact, Motion
 from tlf_env.task.arrays import Info, State
 from tlf_env.task.formation import Formation
-
-Colour = tuple[int, int, int]
 
 RENDER_MODES = ("rgb_array", "human")
 OVERSAMPLING = 2
@@ -36,32 +41,8 @@ TREAD: Colour = (205, 208, 212)
 ALARM: Colour = (236, 0, 84)  # slip, lost, touched: no robot has it
 SLIPPERY: Colour = (214, 233, 246)
 GRIPPY: Colour = (247, 232, 210)
-# Okabe and Ito's colours but yellow; more robots go along viridis. The figures have the same.
-FEW_COLOURS: tuple[Colour, ...] = (
-    (0, 114, 178),
-    (230, 159, 0),
-    (0, 0, 0),
-    (86, 180, 233),
-    (213, 94, 0),
-    (0, 158, 115),
-    (204, 121, 167),
-)
-VIRIDIS = np.array(
-    [
-        (68, 1, 84),
-        (71, 44, 122),
-        (59, 81, 139),
-        (44, 113, 142),
-        (33, 144, 141),
-        (39, 173, 129),
-        (92, 200, 99),
-        (170, 220, 50),
-        (253, 231, 37),
-    ]
-)
-LIGHTEST = 0.92  # of the map; its end is lost on white
 
-DRIVE_WHEEL_WIDTH_MM, CASTOR_WIDTH_MM, AXLE_MM = 22.0, 14.0, 8.0  # for the picture only
+AXLE_MM = 8.0  # for the picture only
 TREADS, TREAD_RADII = 4, 0.2  # few: more would seem to turn backwards at top speed and 20 frames/s
 SLIP_SHOWN_MM_S, SLIP_FULL_MM_S = (
     2.0,
@@ -85,7 +66,6 @@ GRID_PX = 90  # least side of a grid square
 COLUMNS_PX = (18, 140, 208, 218)  # name, error, time gap, flags
 
 CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 37)) for f in (np.cos, np.sin)], axis=-1)
-NOSE = ((-0.26, 0.44), (0.26, 0.44), (0.0, 0.92))  # of what the outline is ahead of c
 
 
 class Scene(NamedTuple):
@@ -166,15 +146,6 @@ def _ghosts(formation: Formation, theta: np.ndarray) -> np.ndarray:
     moved = np.hypot(went_x, went_y) > STILL_MM
     ghosts[2, 1:] = np.where(moved, np.arctan2(-went_x, went_y), theta[:-1])
     return ghosts
-
-
-def robot_colours(robots: int) -> list[Colour]:
-    """Colours that colour-blind eyes can tell apart, as in the figures of a run."""
-    if robots <= len(FEW_COLOURS):
-        return list(FEW_COLOURS[:robots])
-    along = LIGHTEST * np.linspace(0, len(VIRIDIS) - 1, robots)
-    channels = [np.interp(along, np.arange(len(VIRIDIS)), channel) for channel in VIRIDIS.T]
-    return [(round(r), round(g), round(b)) for r, g, b in zip(*channels, strict=True)]
 
 
 class View(NamedTuple):
