@@ -135,11 +135,12 @@ def functionals(record: Record) -> Figure:
 def wheels(record: Record) -> Figure:
     """Wheel speeds, commanded and actual, and torques within their limits, a row for each robot."""
     figure, rows = _rows(record, 0, 13.0, columns=4)
-    limit = record.scenario.robot.torque_limit_Nmm
     columns = [f"omega_{side}{kind}_rad_s" for kind in ("_command", "") for side in "lr"]
     speeds = np.stack([record[column] for column in columns])
     margin = 0.05 * max(float(np.ptp(speeds)), 1e-3)
+    limits = [robot.torque_limit_Nmm for robot in record.scenario.robot_models]
     for i, row in rows.items():
+        limit = limits[i]
         for axes, side, command, actual in zip(row[:2], "lr", speeds[:2], speeds[2:], strict=True):
             axes.plot(*thinned(record.t_s, command[:, i]), color=COMMAND_COLOUR, lw=0.9)
             axes.plot(*thinned(record.t_s, actual[:, i]), color=ACTUAL_COLOUR, lw=0.9)
@@ -154,10 +155,11 @@ def wheels(record: Record) -> Figure:
             axes.set_ylabel("torque (N·mm)")
     for k, name in enumerate(("left speed", "right speed", "left torque", "right torque")):
         rows[0][k].set_title(name, fontsize="medium")
+    where = f"±{limits[0]:g} N·mm" if len(set(limits)) == 1 else "the band's edges"
     handles = [
         Line2D([], [], color=COMMAND_COLOUR, label="command"),
         Line2D([], [], color=ACTUAL_COLOUR, label="actual"),
-        Patch(color=PALE, label=f"motors saturate at ±{limit:g} N·mm"),
+        Patch(color=PALE, label=f"motors saturate at {where}"),
     ]
     _legend(figure, handles)
     return figure
@@ -166,8 +168,8 @@ def wheels(record: Record) -> Figure:
 def slip(record: Record) -> Figure:
     """Slip speed of the drive wheel that slips more, its largest within each control step."""
     figure, rows = _rows(record, 0, 8.0)
-    stiction = record.scenario.robot.tyre.stiction_speed_mm_s
-    most = max(2 * float(record["slip_mm_s"].max()), 5 * stiction)
+    stictions = [robot.tyre.stiction_speed_mm_s for robot in record.scenario.robot_models]
+    most = max(2 * float(record["slip_mm_s"].max()), 5 * max(stictions))
     for i, (axes,) in rows.items():
         axes.plot(*thinned(record.t_s, record["slip_mm_s"][:, i]), color=_colour(record, i), lw=0.8)
         axes.set_yscale("symlog", linthresh=1.0)
@@ -175,7 +177,7 @@ def slip(record: Record) -> Figure:
         axes.yaxis.set_minor_locator(NullLocator())
         axes.set_ylim(-0.1, most)  # so that a line along zero shows
         axes.set_ylabel(f"robot {i}\nslip (mm/s)")
-        _mark_level(axes, stiction, "$v_s$")
+        _mark_level(axes, stictions[i], "$v_s$")
     return figure
 
 
@@ -239,7 +241,7 @@ def body_polygons(record: Record, k: int, i: int) -> list[np.ndarray]:
     Body axes are e = (cos θ, sin θ), right, and f = (−sin θ, cos θ), forward. The castor's fork is
     turned by ``castor_rad`` and its wheel trails behind the pivot.
     """
-    robot = record.scenario.robot
+    robot = record.scenario.robot_models[i]
     c = np.array([record["x_mm"][k, i], record["y_mm"][k, i]])
     theta = record["theta_rad"][k, i]
     body, fork = _axes_of(theta), _axes_of(theta + record["castor_rad"][k, i])
@@ -260,7 +262,7 @@ def snapshot_rows(record: Record) -> list[int]:
     """Rows at which to draw the robots: the last, then those farthest from what is drawn already."""
     every_s = _round_above(record.t_s[-1] / 100)
     every = max(1, round(every_s / record.scenario.control_period_s))
-    room_mm = SNAPSHOT_ROOM * 2 * record.scenario.robot.outline_radius_mm
+    room_mm = SNAPSHOT_ROOM * 2 * _largest_radius_mm(record)
     places = _places(record)
     last = len(places) - 1
     chosen, candidates = [last], list(range(0, last, every))
@@ -284,6 +286,10 @@ def _rectangle(width: float, length: float) -> np.ndarray:
 def _places(record: Record) -> np.ndarray:
     """(time, robot, 2), mm."""
     return np.stack([record["x_mm"], record["y_mm"]], axis=-1)
+
+
+def _largest_radius_mm(record: Record) -> float:
+    return max(robot.outline_radius_mm for robot in record.scenario.robot_models)
 
 
 def _has_time_gap(record: Record) -> bool:
@@ -464,7 +470,7 @@ def _signed_scale(axes: Axes, sizes: np.ndarray) -> None:
 def _extent(record: Record) -> tuple[np.ndarray, np.ndarray]:
     """Lower left and upper right corner of the plane, mm: everything, with room for bodies."""
     everything = np.concatenate([_places(record).reshape(-1, 2), record.leader])
-    room_mm = 2.5 * record.scenario.robot.outline_radius_mm
+    room_mm = 2.5 * _largest_radius_mm(record)
     low, high = everything.min(axis=0) - room_mm, everything.max(axis=0) + room_mm
     width, height = size = high - low
     more = np.maximum(size, (height * SLIMMEST, width / WIDEST)) - size
@@ -503,7 +509,7 @@ def _plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
 
 
 def _draw_body(record: Record, axes: Axes, k: int, i: int, strength: float) -> None:
-    robot = record.scenario.robot
+    robot = record.scenario.robot_models[i]
     line = 1 - strength * (1 - np.array(to_rgb(_colour(record, i))))
     centre = np.array([0, -robot.outline_offset_mm]) @ _axes_of(record["theta_rad"][k, i])
     x, y = _places(record)[k, i] + centre
@@ -520,7 +526,8 @@ def _time_label(record: Record, axes: Axes, k: int, rows: Sequence[int]) -> None
     half_mm = np.array([0.3, 0.12]) * (high - low)[1] / PLANE_IN  # of the text
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     sides = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
-    beside = places[k, 0] + sides * (1.5 * record.scenario.robot.outline_radius_mm + half_mm)
+    radius_mm = record.scenario.robot_models[0].outline_radius_mm
+    beside = places[k, 0] + sides * (1.5 * radius_mm + half_mm)
     apart = np.linalg.norm(beside[:, None] - busy.reshape(-1, 2), axis=-1).min(axis=1)
     inside = np.all((beside - half_mm > low) & (beside + half_mm < high), axis=1)
     axes.annotate(
