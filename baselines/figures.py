@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -39,6 +40,7 @@ NOTE: dict[str, Any] = {"textcoords": "offset points", "color": GREY, "fontsize"
 MOST_POINTS = 4000  # per line: more do not show
 PLANE_IN = 5.6  # height of the plane
 SLIMMEST, WIDEST = 0.6, 1.8  # its width by its height
+NARROWEST_IN = 6.0  # of a figure, so that its title takes two lines at most
 ROW_IN = 1.25  # height of a robot's row
 MOST_SHOWN = 24  # rows of robots, and entries of a legend
 
@@ -121,7 +123,7 @@ def functionals(record: Record) -> Figure:
             _robot_line(record, whole, i, record.t_s, values[:, i])
             _robot_line(record, late, i, late_s, values[settle:, i] - values[settle, i])
         _signed_scale(whole, np.abs(values).max(axis=0))
-        whole.set_ylabel(f"{symbol} ({unit})")
+        _label(whole, f"{symbol} ({unit})")
         late.set_ylabel(f"{symbol} gained since {late_s[0]:g} s ({unit})")
         _tidy(whole, late)
         _settle_line(record, whole)
@@ -176,7 +178,7 @@ def slip(record: Record) -> Figure:
         axes.set_yticks([0, 1, 10, 100, 1000], ["0", "1", "10", "100", "1000"])
         axes.yaxis.set_minor_locator(NullLocator())
         axes.set_ylim(-0.1, most)  # so that a line along zero shows
-        axes.set_ylabel(f"robot {i}\nslip (mm/s)")
+        _label(axes, f"robot {i}\nslip (mm/s)")
         _mark_level(axes, stictions[i], "$v_s$")
     return figure
 
@@ -186,7 +188,7 @@ def time_gap(record: Record) -> Figure:
     figure, rows = _rows(record, 1, 8.0, sharey=True)
     for i, (axes,) in rows.items():
         _time_gap_error(record, axes, [i])
-        axes.set_ylabel(f"robot {i}\nerror (s)")
+        _label(axes, f"robot {i}\nerror (s)")
     _settle_label(record, rows[1][0])
     return figure
 
@@ -303,8 +305,8 @@ def _round_above(value: float) -> float:
 
 
 def _figure(record: Record, width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    figure.suptitle(title(record), fontsize="medium")
+    figure = Figure(figsize=(max(width_in, NARROWEST_IN), height_in), layout="constrained")
+    figure.suptitle(title(record), fontsize="medium", wrap=True)
     return figure
 
 
@@ -357,15 +359,27 @@ def _robot_line(
 
 
 def _legend(figure: Figure, handles: Sequence[Artist], columns: int = 7) -> None:
+    """A legend below the axes, in at most ``columns`` columns and in as many as the figure holds."""
     shown = [handles[k] for k in _spread(len(handles))]
-    rows = -(-len(shown) // columns)
-    figure.legend(
-        handles=shown,
-        loc="outside lower center",
-        ncols=-(-len(shown) // rows),
-        frameon=False,
-        fontsize="small",
-    )
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    while True:
+        rows = -(-len(shown) // columns)
+        legend = figure.legend(
+            handles=shown,
+            loc="outside lower center",
+            ncols=-(-len(shown) // rows),
+            frameon=False,
+            fontsize="small",
+        )
+        if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
+            return
+        legend.remove()
+        columns -= 1
+
+
+def _label(axes: Axes, text: str) -> None:
+    """Name the vertical axis, and its scale where that is linear in the middle only."""
+    axes.set_ylabel(text + ("\nsymlog" if axes.get_yscale() == "symlog" else ""))
 
 
 def _tidy(*panels: Axes) -> None:
@@ -424,7 +438,7 @@ def _heading_error(record: Record, axes: Axes) -> None:
     for i in range(record.robots):
         _robot_line(record, axes, i, record.t_s, error[:, i], jump=np.pi)
     _signed_scale(axes, _sizes(error))
-    axes.set_ylabel("heading error (rad)")
+    _label(axes, "heading error (rad)")
     _settle_line(record, axes)
     _tidy(axes)
 
@@ -439,7 +453,7 @@ def _time_gap_error(record: Record, axes: Axes, robots: Sequence[int] = ()) -> N
     if np.abs(error).max() > 0.99 * TIME_GAP_WINDOW_S:
         for side in (-TIME_GAP_WINDOW_S, TIME_GAP_WINDOW_S):
             _mark_level(axes, side, "window")
-    axes.set_ylabel("time-gap error (s)")
+    _label(axes, "time-gap error (s)")
     _settle_line(record, axes)
     _tidy(axes)
 

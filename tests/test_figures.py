@@ -98,7 +98,7 @@ def test_a_run_is_drawn_alike_every_time_and_in_every_format(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("kind", ["1", "3", "lost"])
 def test_every_axis_has_a_unit(kind: str) -> None:
-    with_unit = re.compile(rf" \(({'|'.join(UNITS)})\)$")
+    with_unit = re.compile(rf" \(({'|'.join(UNITS)})\)(\nsymlog)?$")
     for name, draw in figures.FIGURES.items():
         if name == "time_gap" and kind == "1":
             continue
@@ -107,6 +107,20 @@ def test_every_axis_has_a_unit(kind: str) -> None:
             below = axes.get_subplotspec()
             if below is not None and below.is_last_row():
                 assert with_unit.search(axes.get_xlabel()), (name, axes.get_xlabel())
+
+
+@pytest.mark.parametrize("kind", ["1", "3", "lost"])
+def test_an_axis_says_symlog_if_and_only_if_it_is(kind: str) -> None:
+    panels = [
+        axes
+        for name, draw in figures.FIGURES.items()
+        if name != "time_gap" or kind != "1"
+        for axes in draw(record(kind)).axes
+    ]
+    scales = {axes.get_yscale() for axes in panels}
+    assert {"linear", "log", "symlog"} <= scales
+    for axes in panels:
+        assert axes.get_ylabel().endswith("\nsymlog") == (axes.get_yscale() == "symlog")
 
 
 @pytest.mark.parametrize("n", [1, 3, 10])
@@ -177,12 +191,18 @@ def test_nothing_lies_beyond_the_limits(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["overview", "paths", "errors", "functionals"])
-@pytest.mark.parametrize("kind", ["1", "3", "20", "20 lost"])
+@pytest.mark.parametrize("kind", ["1", "3", "20", "20 lost", "3 slim"])
 def test_texts_stay_clear_of_the_axes_and_of_each_other(kind: str, name: str) -> None:
     run = record(kind.split()[0])
     if kind.endswith("lost"):  # the longest names
         columns = {**run.columns, "position_error_mm": 1000 + run["position_error_mm"]}
         run = replace(run, columns=columns, lost_at_s=np.full(run.robots, 1.0))
+    if kind.endswith("slim"):  # the narrowest plane, and a name longer than it
+        y_mm = np.linspace(0.0, 9000.0, len(run.t_s))
+        along = {"x_mm": 0.0 * run["x_mm"], "y_mm": np.tile(y_mm[:, None], (1, run.robots))}
+        leader = np.stack([0.0 * y_mm, y_mm], axis=-1)
+        policy = "a_learned_policy of several words and numbers, 1 to 9, of a long training"
+        run = replace(run, columns={**run.columns, **along}, leader=leader, policy=policy)
     figure = drawn(figures.FIGURES[name](run))
     whole = figure.bbox
     panels = [axes.get_window_extent() for axes in figure.axes]
