@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+import tlf_env
 from tlf_env.envs.looks import NOSE, robot_colours
 from tlf_env.envs.rendering import ALARM, FLOOR, Renderer, Scene, round_length
 from tlf_env.physics.parameters import RobotParameters
@@ -386,3 +387,75 @@ def test_a_ghost_that_stood_still_heads_as_its_robot_does() -> None:
         env.step({agent: np.zeros(2) for agent in env.agents})
     scene = scene_of(env.formation)
     assert np.allclose(scene.ghost_theta_rad[1:], scene.theta_rad[:-1], atol=1e-6)
+
+
+ROUTE = {
+    "trajectory": {
+        "type": "waypoints",
+        "points": [  # t_s, x_mm, y_mm
+            [0, 0, 0],
+            [6, 1500, 0],
+            [12, 3000, 1200],
+            [18, 3000, 3000],
+            [30, 0, 3000],
+        ],
+    },
+    "robots": 2,
+    "time_gap_s": 1.0,
+    "horizon_s": 10.0,
+}
+POSES = np.array([[-500.0, 700.0, 0.3], [-900.0, 200.0, -1.0]])
+
+
+def still(agents: list[str]) -> dict[str, np.ndarray]:
+    return {agent: np.zeros(2) for agent in agents}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [None, {"poses": POSES}, {"phase_s": 8.0}],
+    ids=["plain", "poses", "phase"],
+)
+@pytest.mark.parametrize("steps", [0, 1, 60])
+def test_nothing_of_an_episode_shows_in_the_next(options: Any, steps: int) -> None:
+    used, fresh = (tlf_env.parallel_env(ROUTE, render_mode="rgb_array") for _ in range(2))
+    used.reset(seed=3)
+    for _ in range(steps):
+        used.step({agent: np.array([1.0, 0.3]) for agent in used.agents})
+        used.render()
+    used.render()
+    for env in (used, fresh):
+        env.reset(seed=5, options=options)
+    for _ in range(3):
+        assert np.array_equal(used.render(), fresh.render())
+        for env in (used, fresh):
+            env.step(still(env.agents))
+
+
+def test_the_path_shown_is_that_of_the_episode() -> None:
+    renderer = make_renderer(1, **BARE)
+    frame(renderer, make_scene(1))
+    renderer.begin(0.5 * PATH_MM)
+    other = Renderer([RobotParameters()], 0.5 * PATH_MM, mode="rgb_array", fps=50.0, **BARE)
+    assert np.array_equal(frame(renderer, make_scene(1)), frame(other, make_scene(1)))
+
+
+def patched(scale: float | None, level: float) -> np.ndarray:
+    """The first frame with a patch of some friction, or none, at a disturbance level."""
+    patch = {"x_mm": 1500.0, "y_mm": 1500.0, "radius_mm": 400.0, "friction_scale": scale}
+    tyre = {"patches": [] if scale is None else [patch]}
+    env = tlf_env.parallel_env(
+        ROUTE, render_mode="rgb_array", disturbance={"tyre": tyre}, disturbance_level=level
+    )
+    env.reset(seed=0)
+    image = env.render()
+    assert image is not None
+    return image
+
+
+def test_patches_show_as_strong_as_the_level_makes_them() -> None:
+    assert np.array_equal(patched(0.5, 0.0), patched(None, 0.0))
+    assert np.array_equal(patched(1.0, 1.0), patched(None, 1.0))
+    assert np.array_equal(patched(0.5, 0.5), patched(0.75, 1.0))
+    assert not np.array_equal(patched(0.5, 1.0), patched(0.75, 1.0))
+    assert not np.array_equal(patched(0.75, 1.0), patched(None, 1.0))

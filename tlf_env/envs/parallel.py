@@ -21,6 +21,7 @@ from tlf_env.onboard.parts import Factory, part_name
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.arrays import END_REASONS, Info, State
 from tlf_env.task.channels import PATHS
+from tlf_env.task.disturbance import PatchRow, patch_rows
 from tlf_env.task.formation import STATE_SCALES, Formation
 from tlf_env.task.judging import terminated, truncated
 from tlf_env.task.observation import OBSERVATION_LIMIT
@@ -161,6 +162,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         else:
             self._episode += 1
         self._formation.reset(self._seed, self._episode, poses, phase_s)
+        if self._renderer is not None:
+            self._renderer.begin(self._path_mm())
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos()
 
@@ -290,15 +293,24 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         if self._renderer is None:
             self._renderer = Renderer(
                 self.scenario.robot_models,
-                self._formation.arrays.table[:, :2],
+                self._path_mm(),
                 mode=self.render_mode,
                 fps=self.metadata["render_fps"],
                 patches=[
-                    patch.model_dump(exclude={"friction_scale"}) | {"scale": patch.friction_scale}
-                    for patch in self.scenario.disturbance.tyre.patches
+                    {
+                        "x_mm": patch.x,
+                        "y_mm": patch.y,
+                        "radius_mm": patch.radius,
+                        "scale": patch.scale,
+                    }
+                    for patch in map(PatchRow._make, patch_rows(self.scenario.disturbance).tolist())
+                    if patch.scale != 1  # else the floor there is as everywhere
                 ],
             )
         return self._renderer.draw(scene_of(self._formation))
+
+    def _path_mm(self) -> np.ndarray:
+        return self._formation.arrays.table[:, :2]
 
     def close(self) -> None:
         """Close the window, if there is one."""

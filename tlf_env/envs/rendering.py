@@ -256,20 +256,30 @@ class Renderer:
             [mixed(FLOOR, colour, part) for colour in self._colours]
             for part in np.linspace(0.15, 0.85, 32).tolist()
         ]
-        stride = max(1, len(path_mm) // PATH_POINTS)
-        self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
         self._patches = list(patches)
         self._fps, self._trail_s = fps, trail_s
         self._close_up = None if close_up is None else min(close_up, len(robots) - 1)
-        self._trail: list[tuple[float, np.ndarray]] = []  # time, (robot, 2)
-        self._background: Any = None
+        self.begin(path_mm)
         self._open, self._window = True, mode == "human"
         if self._window:
             self._open_window(size_px)
         self._resize(size_px)
 
+    def begin(self, path_mm: np.ndarray) -> None:
+        """Forget the last episode: trails and view are made anew from the next scene on.
+
+        Parameters
+        ----------
+        path_mm
+            The leader's whole reference in the episode that begins, ``(k, 2)``.
+        """
+        stride = max(1, len(path_mm) // PATH_POINTS)
+        self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
+        self._trail: list[tuple[float, np.ndarray]] = []  # time, (robot, 2)
+        self._background: Any = None
+
     def draw(self, scene: Scene) -> np.ndarray | None:
-        """Draw a scene; one whose time goes back begins a new episode.
+        """Draw a scene; one whose time goes back begins a new episode on the same path.
 
         Returns a fresh uint8 array ``(H, W, 3)`` in the mode ``"rgb_array"``, else None. Once closed,
         nothing happens.
