@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -459,3 +460,72 @@ def test_patches_show_as_strong_as_the_level_makes_them() -> None:
     assert np.array_equal(patched(0.5, 0.5), patched(0.75, 1.0))
     assert not np.array_equal(patched(0.5, 1.0), patched(0.75, 1.0))
     assert not np.array_equal(patched(0.75, 1.0), patched(None, 1.0))
+
+
+@pytest.fixture
+def drawings(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Times (s) of the scenes drawn, in a window that nobody sees."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame.display.quit()
+    times_s: list[float] = []
+    draw_scene = Renderer.draw
+
+    def noting(renderer: Renderer, scene: Scene) -> np.ndarray | None:
+        times_s.append(round(scene.t_s, 6))
+        return draw_scene(renderer, scene)
+
+    monkeypatch.setattr(Renderer, "draw", noting)
+    return times_s
+
+
+def shown() -> np.ndarray:
+    """What the window shows, ``(height, width, 3)``."""
+    return pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+
+
+def test_a_window_is_drawn_once_by_reset_and_once_by_every_step(drawings: list[float]) -> None:
+    env = tlf_env.parallel_env(ROUTE, render_mode="human")
+    twin = tlf_env.parallel_env(ROUTE, render_mode="rgb_array")
+    env.reset(seed=1)
+    twin.reset(seed=1)
+    assert drawings == [0.0]
+    assert np.array_equal(shown(), twin.render())
+    del drawings[:]
+    for _ in range(3):
+        env.step(still(env.agents))
+        twin.step(still(twin.agents))
+        assert env.render() is None
+    assert drawings == [0.02, 0.04, 0.06]
+    twin.close()
+    env.reset(seed=1)
+    assert drawings[-1] == 0.0
+    env.close()
+    assert not pygame.display.get_init()
+
+
+@pytest.mark.parametrize("made_by", ["gymnasium", "aec"])
+def test_the_other_interfaces_draw_once_per_step_too(made_by: str, drawings: list[float]) -> None:
+    if made_by == "gymnasium":
+        env = gymnasium.make("tlf_env/Infinity-v0", render_mode="human", horizon_s=0.06)
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.zeros(2, np.float32))
+    else:
+        env = tlf_env.aec_env("infinity", render_mode="human", horizon_s=0.06)
+        env.reset(seed=0)
+        for agent in env.agent_iter():
+            ended = env.terminations[agent] or env.truncations[agent]
+            env.step(None if ended else np.zeros(2, np.float32))
+    env.close()
+    assert drawings == [0.0, 0.02, 0.04, 0.06]
+
+
+def test_the_window_stays_closed_once_its_user_has_closed_it(drawings: list[float]) -> None:
+    env = tlf_env.parallel_env(ROUTE, render_mode="human")
+    env.reset(seed=1)
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    for _ in range(2):
+        env.step(still(env.agents))
+    env.reset(seed=1)
+    assert not pygame.display.get_init()
+    env.close()

@@ -57,7 +57,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     scenario
         A preset's name, a YAML file, a mapping or a :class:`~tlf_env.task.scenario.Scenario`.
     render_mode
-        None, ``"rgb_array"`` or ``"human"``.
+        None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, drawn by every
+        :meth:`reset` and :meth:`step`, no faster than the robots move).
     adversary
         Called with the environment before every step; returns ``{channel: value or one per robot}``
         to set for that step, e.g. ``{"slip.delta_1_mm_s": 20.0}``.
@@ -153,6 +154,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         ------
         ValueError
             for a seed out of its range, an unknown option or an impossible value of one.
+        ImportError
+            in mode ``human`` without pygame.
         """
         poses, phase_s = start_options(options or {}, self.scenario.robot_count)
         if seed is not None:
@@ -164,6 +167,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self._formation.reset(self._seed, self._episode, poses, phase_s)
         if self._renderer is not None:
             self._renderer.begin(self._path_mm())
+        if self.render_mode == "human":
+            self._draw(self.render_mode)
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos()
 
@@ -207,6 +212,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             for agent, reason in ends.items():
                 infos[agent]["end"] = reason
             self.agents = []
+        if self.render_mode == "human":
+            self._draw(self.render_mode)
         return observations, rewards, ended, cut, infos
 
     def _take(self, actions: dict[Agent, np.ndarray]) -> None:
@@ -281,6 +288,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     def render(self) -> np.ndarray | None:
         """A frame ``(height, width, 3)`` uint8 in mode ``rgb_array``; None in mode ``human``.
 
+        In mode ``human`` there is nothing left to do: :meth:`reset` and :meth:`step` have drawn.
+
         Raises
         ------
         RuntimeError
@@ -288,13 +297,16 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         """
         if self.render_mode is None or self._seed is None:
             raise RuntimeError("render() needs a render_mode and a reset() before")
+        return None if self.render_mode == "human" else self._draw(self.render_mode)
+
+    def _draw(self, mode: str) -> np.ndarray | None:
         from tlf_env.envs.rendering import Renderer, scene_of
 
         if self._renderer is None:
             self._renderer = Renderer(
                 self.scenario.robot_models,
                 self._path_mm(),
-                mode=self.render_mode,
+                mode=mode,
                 fps=self.metadata["render_fps"],
                 patches=[
                     {
