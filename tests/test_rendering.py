@@ -16,8 +16,10 @@ import numpy as np
 import pytest
 
 import tlf_env
+from tlf_env.envs.drawing import FLOOR
 from tlf_env.envs.looks import NOSE, robot_colours
-from tlf_env.envs.rendering import ALARM, FLOOR, Renderer, Scene, round_length
+from tlf_env.envs.rendering import ALARM, Renderer, round_length
+from tlf_env.envs.scene import Scene
 from tlf_env.physics.parameters import RobotParameters
 
 pygame = pytest.importorskip("pygame")
@@ -349,7 +351,7 @@ def test_a_window_keeps_to_its_frame_rate(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize("robots", [1, 3])
 def test_the_scene_of_a_formation_is_its_truth(robots: int) -> None:
     from tlf_env import parallel_env
-    from tlf_env.envs.rendering import scene_of
+    from tlf_env.envs.scene import scene_of
 
     env = parallel_env("infinity", robots=robots, control_period_s=0.05, time_gap_s=1.0)
     env.reset(seed=1)
@@ -380,7 +382,7 @@ def test_the_scene_of_a_formation_is_its_truth(robots: int) -> None:
 
 def test_a_ghost_that_stood_still_heads_as_its_robot_does() -> None:
     from tlf_env import parallel_env
-    from tlf_env.envs.rendering import scene_of
+    from tlf_env.envs.scene import scene_of
 
     env = parallel_env("infinity", control_period_s=0.05, time_gap_s=1.0, disturbance="none")
     env.reset(seed=1)

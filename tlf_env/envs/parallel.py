@@ -300,7 +300,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return None if self.render_mode == "human" else self._draw(self.render_mode)
 
     def _draw(self, mode: str) -> np.ndarray | None:
-        from tlf_env.envs.rendering import Renderer, scene_of
+        from tlf_env.envs.rendering import Renderer
+        from tlf_env.envs.scene import scene_of
 
         if self._renderer is None:
             self._renderer = Renderer(
