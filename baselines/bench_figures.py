@@ -15,12 +15,11 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.colors import to_hex
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.ticker import NullLocator
 
-from baselines.figures import DPI, FEW_COLOURS, GREY, LIGHTEST, MANY_COLOURS, MARKERS, PALE
+from baselines.figures import DPI, GREY, MARKERS, PALE, hex_colour
 from tlf_env.numerics.files import atomic
 
 Board = dict[str, Any]
@@ -272,10 +271,7 @@ def _style(board: Board, policy: str) -> dict[str, Any]:
     """
     names = policies(board)
     i = names.index(policy)
-    if len(names) <= len(FEW_COLOURS):
-        colour = FEW_COLOURS[i]
-    else:
-        colour = to_hex(MANY_COLOURS(LIGHTEST * i / (len(names) - 1)))
+    colour = hex_colour(i, len(names))
     hollow = policy in _privileged(board)
     under = (len(names) - 1 - i) / max(len(names) - 1, 1)
     return {

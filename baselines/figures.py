@@ -12,9 +12,9 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib import colormaps
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
@@ -24,16 +24,13 @@ from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullLocator
 
 from baselines.run import Record
+from tlf_env.envs.looks import CASTOR_WIDTH_MM, DRIVE_WHEEL_WIDTH_MM, NOSE, robot_colours
 from tlf_env.numerics.files import atomic
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 
 DPI = 150
 METADATA: dict[str, dict[str, Any]] = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
-# Okabe and Ito's colours but yellow, which is lost on white; neighbours differ in luminance too.
-FEW_COLOURS = ("#000000", "#E69F00", "#0072B2", "#56B4E9", "#D55E00", "#009E73", "#CC79A7")
-MANY_COLOURS = colormaps["viridis"]  # from dark to light along the formation
-LIGHTEST = 0.92  # of the map: its end is lost on white
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 MARKERS_PER_LINE = 7
 COMMAND_COLOUR, ACTUAL_COLOUR = "#E69F00", "#0072B2"
@@ -43,13 +40,13 @@ NOTE: dict[str, Any] = {"textcoords": "offset points", "color": GREY, "fontsize"
 MOST_POINTS = 4000  # per line: more do not show
 PLANE_IN = 5.6  # height of the plane
 SLIMMEST, WIDEST = 0.6, 1.8  # its width by its height
+NARROWEST_IN = 6.0  # of a figure, so that its title takes two lines at most
 ROW_IN = 1.25  # height of a robot's row
 MOST_SHOWN = 24  # rows of robots, and entries of a legend
 
 SNAPSHOTS = 4  # times at which the robots are drawn, at most
 SNAPSHOT_ROOM = 1.5  # between robots of different times, in outline diameters
 FADED = 0.5
-DRIVE_WHEEL_WIDTH_MM, CASTOR_WIDTH_MM = 24.0, 16.0  # of the picture; the model's are lines
 
 
 def write_figures(
@@ -126,7 +123,7 @@ def functionals(record: Record) -> Figure:
             _robot_line(record, whole, i, record.t_s, values[:, i])
             _robot_line(record, late, i, late_s, values[settle:, i] - values[settle, i])
         _signed_scale(whole, np.abs(values).max(axis=0))
-        whole.set_ylabel(f"{symbol} ({unit})")
+        _label(whole, f"{symbol} ({unit})")
         late.set_ylabel(f"{symbol} gained since {late_s[0]:g} s ({unit})")
         _tidy(whole, late)
         _settle_line(record, whole)
@@ -140,11 +137,12 @@ def functionals(record: Record) -> Figure:
 def wheels(record: Record) -> Figure:
     """Wheel speeds, commanded and actual, and torques within their limits, a row for each robot."""
     figure, rows = _rows(record, 0, 13.0, columns=4)
-    limit = record.scenario.robot.torque_limit_Nmm
     columns = [f"omega_{side}{kind}_rad_s" for kind in ("_command", "") for side in "lr"]
     speeds = np.stack([record[column] for column in columns])
     margin = 0.05 * max(float(np.ptp(speeds)), 1e-3)
+    limits = [robot.torque_limit_Nmm for robot in record.scenario.robot_models]
     for i, row in rows.items():
+        limit = limits[i]
         for axes, side, command, actual in zip(row[:2], "lr", speeds[:2], speeds[2:], strict=True):
             axes.plot(*thinned(record.t_s, command[:, i]), color=COMMAND_COLOUR, lw=0.9)
             axes.plot(*thinned(record.t_s, actual[:, i]), color=ACTUAL_COLOUR, lw=0.9)
@@ -159,10 +157,11 @@ def wheels(record: Record) -> Figure:
             axes.set_ylabel("torque (N·mm)")
     for k, name in enumerate(("left speed", "right speed", "left torque", "right torque")):
         rows[0][k].set_title(name, fontsize="medium")
+    where = f"±{limits[0]:g} N·mm" if len(set(limits)) == 1 else "the band's edges"
     handles = [
         Line2D([], [], color=COMMAND_COLOUR, label="command"),
         Line2D([], [], color=ACTUAL_COLOUR, label="actual"),
-        Patch(color=PALE, label=f"motors saturate at ±{limit:g} N·mm"),
+        Patch(color=PALE, label=f"motors saturate at {where}"),
     ]
     _legend(figure, handles)
     return figure
@@ -171,16 +170,16 @@ def wheels(record: Record) -> Figure:
 def slip(record: Record) -> Figure:
     """Slip speed of the drive wheel that slips more, its largest within each control step."""
     figure, rows = _rows(record, 0, 8.0)
-    stiction = record.scenario.robot.tyre.stiction_speed_mm_s
-    most = max(2 * float(record["slip_mm_s"].max()), 5 * stiction)
+    stictions = [robot.tyre.stiction_speed_mm_s for robot in record.scenario.robot_models]
+    most = max(2 * float(record["slip_mm_s"].max()), 5 * max(stictions))
     for i, (axes,) in rows.items():
         axes.plot(*thinned(record.t_s, record["slip_mm_s"][:, i]), color=_colour(record, i), lw=0.8)
         axes.set_yscale("symlog", linthresh=1.0)
         axes.set_yticks([0, 1, 10, 100, 1000], ["0", "1", "10", "100", "1000"])
         axes.yaxis.set_minor_locator(NullLocator())
         axes.set_ylim(-0.1, most)  # so that a line along zero shows
-        axes.set_ylabel(f"robot {i}\nslip (mm/s)")
-        _mark_level(axes, stiction, "$v_s$")
+        _label(axes, f"robot {i}\nslip (mm/s)")
+        _mark_level(axes, stictions[i], "$v_s$")
     return figure
 
 
@@ -189,7 +188,7 @@ def time_gap(record: Record) -> Figure:
     figure, rows = _rows(record, 1, 8.0, sharey=True)
     for i, (axes,) in rows.items():
         _time_gap_error(record, axes, [i])
-        axes.set_ylabel(f"robot {i}\nerror (s)")
+        _label(axes, f"robot {i}\nerror (s)")
     _settle_label(record, rows[1][0])
     return figure
 
@@ -228,6 +227,11 @@ def thinned(t_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return t_s[keep], values[keep]
 
 
+def hex_colour(i: int, count: int) -> str:
+    """The colour of number ``i`` of ``count`` robots or policies, as ``#rrggbb``; the renderer's."""
+    return "#{:02x}{:02x}{:02x}".format(*robot_colours(count)[i])
+
+
 def unbroken(values: np.ndarray, jump: float) -> np.ndarray:
     """Values with NaN after each jump beyond ``jump``, so that no line is drawn across."""
     return np.where(np.abs(np.diff(values, prepend=values[:1])) > jump, np.nan, values)
@@ -239,7 +243,7 @@ def body_polygons(record: Record, k: int, i: int) -> list[np.ndarray]:
     Body axes are e = (cos θ, sin θ), right, and f = (−sin θ, cos θ), forward. The castor's fork is
     turned by ``castor_rad`` and its wheel trails behind the pivot.
     """
-    robot = record.scenario.robot
+    robot = record.scenario.robot_models[i]
     c = np.array([record["x_mm"][k, i], record["y_mm"][k, i]])
     theta = record["theta_rad"][k, i]
     body, fork = _axes_of(theta), _axes_of(theta + record["castor_rad"][k, i])
@@ -247,13 +251,12 @@ def body_polygons(record: Record, k: int, i: int) -> list[np.ndarray]:
     front_mm = robot.outline_radius_mm - robot.outline_offset_mm
     tyre = _rectangle(DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm)
     castor = _rectangle(CASTOR_WIDTH_MM, 2 * robot.castor_radius_mm)
-    nose = front_mm * np.array([[-0.35, 0.35], [0.35, 0.35], [0.0, 0.95]])
     pivot = c - robot.castor_pivot_mm * body[1]
     return [
         c - half_mm * body[0] + tyre @ body,
         c + half_mm * body[0] + tyre @ body,
         pivot + (castor - (0, robot.castor_trail_mm)) @ fork,
-        c + nose @ body,
+        c + front_mm * np.array(NOSE) @ body,
     ]
 
 
@@ -261,7 +264,7 @@ def snapshot_rows(record: Record) -> list[int]:
     """Rows at which to draw the robots: the last, then those farthest from what is drawn already."""
     every_s = _round_above(record.t_s[-1] / 100)
     every = max(1, round(every_s / record.scenario.control_period_s))
-    room_mm = SNAPSHOT_ROOM * 2 * record.scenario.robot.outline_radius_mm
+    room_mm = SNAPSHOT_ROOM * 2 * _largest_radius_mm(record)
     places = _places(record)
     last = len(places) - 1
     chosen, candidates = [last], list(range(0, last, every))
@@ -287,6 +290,10 @@ def _places(record: Record) -> np.ndarray:
     return np.stack([record["x_mm"], record["y_mm"]], axis=-1)
 
 
+def _largest_radius_mm(record: Record) -> float:
+    return max(robot.outline_radius_mm for robot in record.scenario.robot_models)
+
+
 def _has_time_gap(record: Record) -> bool:
     return record.robots > 1 and bool(record.t_s[-1] > record.scenario.time_gap_s)
 
@@ -298,8 +305,8 @@ def _round_above(value: float) -> float:
 
 
 def _figure(record: Record, width_in: float, height_in: float) -> Figure:
-    figure = Figure(figsize=(width_in, height_in), layout="constrained")
-    figure.suptitle(title(record), fontsize="medium")
+    figure = Figure(figsize=(max(width_in, NARROWEST_IN), height_in), layout="constrained")
+    figure.suptitle(title(record), fontsize="medium", wrap=True)
     return figure
 
 
@@ -321,10 +328,8 @@ def _rows(
     return figure, dict(zip(robots.tolist(), grid, strict=True))
 
 
-def _colour(record: Record, i: int) -> Any:
-    if record.robots <= len(FEW_COLOURS):
-        return FEW_COLOURS[i]
-    return MANY_COLOURS(LIGHTEST * i / (record.robots - 1))
+def _colour(record: Record, i: int) -> str:
+    return hex_colour(i, record.robots)
 
 
 def _robot_line(
@@ -354,15 +359,27 @@ def _robot_line(
 
 
 def _legend(figure: Figure, handles: Sequence[Artist], columns: int = 7) -> None:
+    """A legend below the axes, in at most ``columns`` columns and in as many as the figure holds."""
     shown = [handles[k] for k in _spread(len(handles))]
-    rows = -(-len(shown) // columns)
-    figure.legend(
-        handles=shown,
-        loc="outside lower center",
-        ncols=-(-len(shown) // rows),
-        frameon=False,
-        fontsize="small",
-    )
+    renderer = FigureCanvasAgg(figure).get_renderer()
+    while True:
+        rows = -(-len(shown) // columns)
+        legend = figure.legend(
+            handles=shown,
+            loc="outside lower center",
+            ncols=-(-len(shown) // rows),
+            frameon=False,
+            fontsize="small",
+        )
+        if columns == 1 or legend.get_window_extent(renderer).width <= figure.bbox.width:
+            return
+        legend.remove()
+        columns -= 1
+
+
+def _label(axes: Axes, text: str) -> None:
+    """Name the vertical axis, and its scale where that is linear in the middle only."""
+    axes.set_ylabel(text + ("\nsymlog" if axes.get_yscale() == "symlog" else ""))
 
 
 def _tidy(*panels: Axes) -> None:
@@ -421,7 +438,7 @@ def _heading_error(record: Record, axes: Axes) -> None:
     for i in range(record.robots):
         _robot_line(record, axes, i, record.t_s, error[:, i], jump=np.pi)
     _signed_scale(axes, _sizes(error))
-    axes.set_ylabel("heading error (rad)")
+    _label(axes, "heading error (rad)")
     _settle_line(record, axes)
     _tidy(axes)
 
@@ -436,7 +453,7 @@ def _time_gap_error(record: Record, axes: Axes, robots: Sequence[int] = ()) -> N
     if np.abs(error).max() > 0.99 * TIME_GAP_WINDOW_S:
         for side in (-TIME_GAP_WINDOW_S, TIME_GAP_WINDOW_S):
             _mark_level(axes, side, "window")
-    axes.set_ylabel("time-gap error (s)")
+    _label(axes, "time-gap error (s)")
     _settle_line(record, axes)
     _tidy(axes)
 
@@ -467,7 +484,7 @@ def _signed_scale(axes: Axes, sizes: np.ndarray) -> None:
 def _extent(record: Record) -> tuple[np.ndarray, np.ndarray]:
     """Lower left and upper right corner of the plane, mm: everything, with room for bodies."""
     everything = np.concatenate([_places(record).reshape(-1, 2), record.leader])
-    room_mm = 2.5 * record.scenario.robot.outline_radius_mm
+    room_mm = 2.5 * _largest_radius_mm(record)
     low, high = everything.min(axis=0) - room_mm, everything.max(axis=0) + room_mm
     width, height = size = high - low
     more = np.maximum(size, (height * SLIMMEST, width / WIDEST)) - size
@@ -486,7 +503,11 @@ def _plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
     every = max(1, len(record.t_s) // MOST_POINTS)
     axes.plot(*record.leader[::every].T, color="0.8", lw=5.0, zorder=1, label="leader's reference")
     for i in range(n):  # later robots on top and thinner, so that paths that coincide all show
-        style = {"color": _colour(record, i), "marker": MARKERS[i % len(MARKERS)], "mfc": "white"}
+        style: dict[str, Any] = {
+            "color": _colour(record, i),
+            "marker": MARKERS[i % len(MARKERS)],
+            "mfc": "white",
+        }
         path = _places(record)[::every, i]
         width = 1.0 + 2.5 * (n - 1 - i) / max(n - 1, 1)
         axes.plot(*path.T, **style, markevery=[0], lw=width, zorder=2, label=f"robot {i}")
@@ -502,7 +523,7 @@ def _plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
 
 
 def _draw_body(record: Record, axes: Axes, k: int, i: int, strength: float) -> None:
-    robot = record.scenario.robot
+    robot = record.scenario.robot_models[i]
     line = 1 - strength * (1 - np.array(to_rgb(_colour(record, i))))
     centre = np.array([0, -robot.outline_offset_mm]) @ _axes_of(record["theta_rad"][k, i])
     x, y = _places(record)[k, i] + centre
@@ -519,7 +540,8 @@ def _time_label(record: Record, axes: Axes, k: int, rows: Sequence[int]) -> None
     half_mm = np.array([0.3, 0.12]) * (high - low)[1] / PLANE_IN  # of the text
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     sides = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
-    beside = places[k, 0] + sides * (1.5 * record.scenario.robot.outline_radius_mm + half_mm)
+    radius_mm = record.scenario.robot_models[0].outline_radius_mm
+    beside = places[k, 0] + sides * (1.5 * radius_mm + half_mm)
     apart = np.linalg.norm(beside[:, None] - busy.reshape(-1, 2), axis=-1).min(axis=1)
     inside = np.all((beside - half_mm > low) & (beside + half_mm < high), axis=1)
     axes.annotate(

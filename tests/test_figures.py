@@ -25,6 +25,13 @@ UNITS = ("mm", "s", "rad", "mm/s", "rad/s", "N·mm", "mm·s", "rad·s")
 PNG = b"\x89PNG"
 
 
+MIXED: list[dict[str, Any]] = [
+    {},
+    {"torque_limit_Nmm": 20.0, "axle_width_mm": 190.0, "wheel_radius_mm": 55.0},
+    {"tyre": {"stiction_speed_mm_s": 2.0}, "outline_radius_mm": 150.0},
+]
+
+
 class Away:
     """Drives off the reference as fast as it can, turning all the time."""
 
@@ -42,6 +49,8 @@ def record(kind: str) -> Record:
         overrides = {"robots": 2, "horizon_s": 0.5}
     elif kind == "one step":
         overrides = {"robots": 2, "horizon_s": 0.02}
+    elif kind == "mixed":
+        overrides = {"robots": MIXED, "horizon_s": 0.1, "start_spacing_mm": 400.0}
     elif kind.isdigit():
         overrides["robots"] = int(kind)
     return run_policy(load_scenario("flower", **overrides), policy, name="test")
@@ -89,7 +98,7 @@ def test_a_run_is_drawn_alike_every_time_and_in_every_format(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("kind", ["1", "3", "lost"])
 def test_every_axis_has_a_unit(kind: str) -> None:
-    with_unit = re.compile(rf" \(({'|'.join(UNITS)})\)$")
+    with_unit = re.compile(rf" \(({'|'.join(UNITS)})\)(\nsymlog)?$")
     for name, draw in figures.FIGURES.items():
         if name == "time_gap" and kind == "1":
             continue
@@ -98,6 +107,20 @@ def test_every_axis_has_a_unit(kind: str) -> None:
             below = axes.get_subplotspec()
             if below is not None and below.is_last_row():
                 assert with_unit.search(axes.get_xlabel()), (name, axes.get_xlabel())
+
+
+@pytest.mark.parametrize("kind", ["1", "3", "lost"])
+def test_an_axis_says_symlog_if_and_only_if_it_is(kind: str) -> None:
+    panels = [
+        axes
+        for name, draw in figures.FIGURES.items()
+        if name != "time_gap" or kind != "1"
+        for axes in draw(record(kind)).axes
+    ]
+    scales = {axes.get_yscale() for axes in panels}
+    assert {"linear", "log", "symlog"} <= scales
+    for axes in panels:
+        assert axes.get_ylabel().endswith("\nsymlog") == (axes.get_yscale() == "symlog")
 
 
 @pytest.mark.parametrize("n", [1, 3, 10])
@@ -168,12 +191,18 @@ def test_nothing_lies_beyond_the_limits(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["overview", "paths", "errors", "functionals"])
-@pytest.mark.parametrize("kind", ["1", "3", "20", "20 lost"])
+@pytest.mark.parametrize("kind", ["1", "3", "20", "20 lost", "3 slim"])
 def test_texts_stay_clear_of_the_axes_and_of_each_other(kind: str, name: str) -> None:
     run = record(kind.split()[0])
     if kind.endswith("lost"):  # the longest names
         columns = {**run.columns, "position_error_mm": 1000 + run["position_error_mm"]}
         run = replace(run, columns=columns, lost_at_s=np.full(run.robots, 1.0))
+    if kind.endswith("slim"):  # the narrowest plane, and a name longer than it
+        y_mm = np.linspace(0.0, 9000.0, len(run.t_s))
+        along = {"x_mm": 0.0 * run["x_mm"], "y_mm": np.tile(y_mm[:, None], (1, run.robots))}
+        leader = np.stack([0.0 * y_mm, y_mm], axis=-1)
+        policy = "a_learned_policy of several words and numbers, 1 to 9, of a long training"
+        run = replace(run, columns={**run.columns, **along}, leader=leader, policy=policy)
     figure = drawn(figures.FIGURES[name](run))
     whole = figure.bbox
     panels = [axes.get_window_extent() for axes in figure.axes]
@@ -203,6 +232,46 @@ def test_robots_are_drawn_at_the_snapshots_and_each_time_is_named_once(kind: str
     parts = [part for part in plane.collections if isinstance(part, PolyCollection)]
     assert len(parts) == len(outlines)
     assert plane.get_aspect() == 1.0
+
+
+def test_every_robot_is_drawn_with_its_own_measures() -> None:
+    run = record("mixed")
+    models = run.scenario.robot_models
+    rows = [figures.wheels(run).axes[4 * i : 4 * i + 4] for i in range(3)]
+    bands = [[axes.patches[0] for axes in row[2:]] for row in rows]
+    for model, row, two in zip(models, rows, bands, strict=True):
+        limit = model.torque_limit_Nmm
+        assert [(p.get_y(), p.get_height()) for p in two] == [(-limit, 2 * limit)] * 2
+        assert [axes.get_yticks().tolist() for axes in row[2:]] == [[-limit, 0, limit]] * 2
+    assert [two[0].get_y() for two in bands] == [-15.0, -20.0, -15.0]
+    levels = [axes.lines[-1].get_ydata()[0] for axes in figures.slip(run).axes]
+    assert levels == [model.tyre.stiction_speed_mm_s for model in models]
+
+    plane = figures.paths(run).axes[0]
+    outlines = [patch for patch in plane.patches if isinstance(patch, Circle)]
+    assert [circle.get_radius() for circle in outlines] == [
+        model.outline_radius_mm for model in models
+    ]
+    assert plane.get_xlim()[1] > run["x_mm"].max() + 150.0
+    for i, model in enumerate(models):
+        left, right, castor, _ = figures.body_polygons(run, 0, i)
+        axle_mm = np.linalg.norm(left.mean(axis=0) - right.mean(axis=0))
+        assert axle_mm == pytest.approx(model.axle_width_mm)
+        assert np.linalg.norm(left[2] - left[1]) == pytest.approx(2 * model.wheel_radius_mm)
+        c = np.array([run["x_mm"][0, i], run["y_mm"][0, i]])
+        behind_mm = np.linalg.norm(castor.mean(axis=0) - c)
+        trailing = model.castor_pivot_mm + model.castor_trail_mm * np.cos(run["castor_rad"][0, i])
+        aside = model.castor_trail_mm * np.sin(run["castor_rad"][0, i])
+        assert behind_mm == pytest.approx(np.hypot(trailing, aside))
+
+
+def test_the_legend_names_a_torque_limit_that_all_motors_share_and_no_other() -> None:
+    for kind, text in (
+        ("3", "motors saturate at ±15 N·mm"),
+        ("mixed", "motors saturate at the band's edges"),
+    ):
+        legend = figures.wheels(record(kind)).legends[0]
+        assert legend.get_texts()[-1].get_text() == text
 
 
 def test_snapshots_keep_their_distance() -> None:
@@ -289,6 +358,7 @@ def test_very_many_robots_get_a_spread_of_rows() -> None:
     many = {name: np.tile(column, (1, 40)) for name, column in run.columns.items()}
     crowd = replace(
         run,
+        scenario=load_scenario(run.scenario, robots=400),
         columns=many,
         lost_at_s=np.tile(run.lost_at_s, 40),
         touched_at_s=np.tile(run.touched_at_s, 40),

@@ -11,10 +11,15 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 import pytest
 
-from tlf_env.envs.rendering import ALARM, FLOOR, Renderer, Scene, robot_colours, round_length
+import tlf_env
+from tlf_env.envs.drawing import FLOOR
+from tlf_env.envs.looks import NOSE, robot_colours
+from tlf_env.envs.rendering import ALARM, Renderer, round_length
+from tlf_env.envs.scene import Scene
 from tlf_env.physics.parameters import RobotParameters
 
 pygame = pytest.importorskip("pygame")
@@ -235,6 +240,34 @@ def test_colours_differ() -> None:
         assert ALARM not in robot_colours(robots)
 
 
+@pytest.mark.parametrize("robots", [3, 9])
+def test_a_robot_has_the_colour_that_it_has_in_the_figures(robots: int) -> None:
+    figures = pytest.importorskip("baselines.figures")
+    from matplotlib.colors import to_rgb
+
+    from baselines import ReferencePolicy
+    from baselines.run import run_policy
+    from tlf_env import load_scenario
+
+    run = run_policy(load_scenario("flower", robots=robots, horizon_s=0.02), ReferencePolicy())
+    labelled = {line.get_label(): line for line in figures.paths(run).axes[0].lines}
+    x_mm = 3000.0 - 750.0 * np.arange(robots)
+    renderer = make_renderer(robots, close_up=None, size_px=(1920, 1440))
+    everyone = frame(renderer, make_scene(robots, x_mm=x_mm))
+    for i in range(robots):
+        colour = tuple(round(255 * c) for c in to_rgb(labelled[f"robot {i}"].get_color()))
+        others = np.where(np.arange(robots) == i, np.nan, x_mm)
+        without = frame(renderer, make_scene(robots, x_mm=others))
+        assert count(everyone, colour, 0) > count(without, colour, 0) + 20
+
+
+def test_a_nose_cannot_be_taken_for_pointing_elsewhere() -> None:
+    left, right, tip = np.array(NOSE)
+    base, sides = math.dist(left, right), (math.dist(left, tip), math.dist(right, tip))
+    assert sides[0] == pytest.approx(sides[1])
+    assert sides[0] > 1.8 * base
+
+
 def test_round_lengths() -> None:
     assert [round_length(least) for least in (0.9, 1.0, 1.1, 3.0, 70.0, 600.0)] == pytest.approx(
         [1.0, 1.0, 2.0, 5.0, 100.0, 1000.0]
@@ -318,7 +351,7 @@ def test_a_window_keeps_to_its_frame_rate(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize("robots", [1, 3])
 def test_the_scene_of_a_formation_is_its_truth(robots: int) -> None:
     from tlf_env import parallel_env
-    from tlf_env.envs.rendering import scene_of
+    from tlf_env.envs.scene import scene_of
 
     env = parallel_env("infinity", robots=robots, control_period_s=0.05, time_gap_s=1.0)
     env.reset(seed=1)
@@ -349,7 +382,7 @@ def test_the_scene_of_a_formation_is_its_truth(robots: int) -> None:
 
 def test_a_ghost_that_stood_still_heads_as_its_robot_does() -> None:
     from tlf_env import parallel_env
-    from tlf_env.envs.rendering import scene_of
+    from tlf_env.envs.scene import scene_of
 
     env = parallel_env("infinity", control_period_s=0.05, time_gap_s=1.0, disturbance="none")
     env.reset(seed=1)
@@ -357,3 +390,144 @@ def test_a_ghost_that_stood_still_heads_as_its_robot_does() -> None:
         env.step({agent: np.zeros(2) for agent in env.agents})
     scene = scene_of(env.formation)
     assert np.allclose(scene.ghost_theta_rad[1:], scene.theta_rad[:-1], atol=1e-6)
+
+
+ROUTE = {
+    "trajectory": {
+        "type": "waypoints",
+        "points": [  # t_s, x_mm, y_mm
+            [0, 0, 0],
+            [6, 1500, 0],
+            [12, 3000, 1200],
+            [18, 3000, 3000],
+            [30, 0, 3000],
+        ],
+    },
+    "robots": 2,
+    "time_gap_s": 1.0,
+    "horizon_s": 10.0,
+}
+POSES = np.array([[-500.0, 700.0, 0.3], [-900.0, 200.0, -1.0]])
+
+
+def still(agents: list[str]) -> dict[str, np.ndarray]:
+    return {agent: np.zeros(2) for agent in agents}
+
+
+@pytest.mark.parametrize(
+    "options",
+    [None, {"poses": POSES}, {"phase_s": 8.0}],
+    ids=["plain", "poses", "phase"],
+)
+@pytest.mark.parametrize("steps", [0, 1, 60])
+def test_nothing_of_an_episode_shows_in_the_next(options: Any, steps: int) -> None:
+    used, fresh = (tlf_env.parallel_env(ROUTE, render_mode="rgb_array") for _ in range(2))
+    used.reset(seed=3)
+    for _ in range(steps):
+        used.step({agent: np.array([1.0, 0.3]) for agent in used.agents})
+        used.render()
+    used.render()
+    for env in (used, fresh):
+        env.reset(seed=5, options=options)
+    for _ in range(3):
+        assert np.array_equal(used.render(), fresh.render())
+        for env in (used, fresh):
+            env.step(still(env.agents))
+
+
+def test_the_path_shown_is_that_of_the_episode() -> None:
+    renderer = make_renderer(1, **BARE)
+    frame(renderer, make_scene(1))
+    renderer.begin(0.5 * PATH_MM)
+    other = Renderer([RobotParameters()], 0.5 * PATH_MM, mode="rgb_array", fps=50.0, **BARE)
+    assert np.array_equal(frame(renderer, make_scene(1)), frame(other, make_scene(1)))
+
+
+def patched(scale: float | None, level: float) -> np.ndarray:
+    """The first frame with a patch of some friction, or none, at a disturbance level."""
+    patch = {"x_mm": 1500.0, "y_mm": 1500.0, "radius_mm": 400.0, "friction_scale": scale}
+    tyre = {"patches": [] if scale is None else [patch]}
+    env = tlf_env.parallel_env(
+        ROUTE, render_mode="rgb_array", disturbance={"tyre": tyre}, disturbance_level=level
+    )
+    env.reset(seed=0)
+    image = env.render()
+    assert image is not None
+    return image
+
+
+def test_patches_show_as_strong_as_the_level_makes_them() -> None:
+    assert np.array_equal(patched(0.5, 0.0), patched(None, 0.0))
+    assert np.array_equal(patched(1.0, 1.0), patched(None, 1.0))
+    assert np.array_equal(patched(0.5, 0.5), patched(0.75, 1.0))
+    assert not np.array_equal(patched(0.5, 1.0), patched(0.75, 1.0))
+    assert not np.array_equal(patched(0.75, 1.0), patched(None, 1.0))
+
+
+@pytest.fixture
+def drawings(monkeypatch: pytest.MonkeyPatch) -> list[float]:
+    """Times (s) of the scenes drawn, in a window that nobody sees."""
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    pygame.display.quit()
+    times_s: list[float] = []
+    draw_scene = Renderer.draw
+
+    def noting(renderer: Renderer, scene: Scene) -> np.ndarray | None:
+        times_s.append(round(scene.t_s, 6))
+        return draw_scene(renderer, scene)
+
+    monkeypatch.setattr(Renderer, "draw", noting)
+    return times_s
+
+
+def shown() -> np.ndarray:
+    """What the window shows, ``(height, width, 3)``."""
+    return pygame.surfarray.array3d(pygame.display.get_surface()).swapaxes(0, 1)
+
+
+def test_a_window_is_drawn_once_by_reset_and_once_by_every_step(drawings: list[float]) -> None:
+    env = tlf_env.parallel_env(ROUTE, render_mode="human")
+    twin = tlf_env.parallel_env(ROUTE, render_mode="rgb_array")
+    env.reset(seed=1)
+    twin.reset(seed=1)
+    assert drawings == [0.0]
+    assert np.array_equal(shown(), twin.render())
+    del drawings[:]
+    for _ in range(3):
+        env.step(still(env.agents))
+        twin.step(still(twin.agents))
+        assert env.render() is None
+    assert drawings == [0.02, 0.04, 0.06]
+    twin.close()
+    env.reset(seed=1)
+    assert drawings[-1] == 0.0
+    env.close()
+    assert not pygame.display.get_init()
+
+
+@pytest.mark.parametrize("made_by", ["gymnasium", "aec"])
+def test_the_other_interfaces_draw_once_per_step_too(made_by: str, drawings: list[float]) -> None:
+    if made_by == "gymnasium":
+        env = gymnasium.make("tlf_env/Infinity-v0", render_mode="human", horizon_s=0.06)
+        env.reset(seed=0)
+        for _ in range(3):
+            env.step(np.zeros(2, np.float32))
+    else:
+        env = tlf_env.aec_env("infinity", render_mode="human", horizon_s=0.06)
+        env.reset(seed=0)
+        for agent in env.agent_iter():
+            ended = env.terminations[agent] or env.truncations[agent]
+            env.step(None if ended else np.zeros(2, np.float32))
+    env.close()
+    assert drawings == [0.0, 0.02, 0.04, 0.06]
+
+
+def test_the_window_stays_closed_once_its_user_has_closed_it(drawings: list[float]) -> None:
+    env = tlf_env.parallel_env(ROUTE, render_mode="human")
+    env.reset(seed=1)
+    pygame.event.post(pygame.event.Event(pygame.QUIT))
+    for _ in range(2):
+        env.step(still(env.agents))
+    env.reset(seed=1)
+    assert not pygame.display.get_init()
+    env.close()

@@ -1,4 +1,6 @@
-"""The video wrappers of both libraries; they need moviepy."""
+"""The video wrappers of both libraries; they need moviepy, of the extra ``view``."""
+
+from pathlib import Path
 
 import gymnasium
 import pytest
@@ -7,24 +9,44 @@ import tlf_env
 
 pytest.importorskip("moviepy")
 
+STEPS = 25
+FPS = 50.0  # one frame a control period: a video runs at the speed of the robots
 
-def test_gymnasium_records_a_video(tmp_path):
-    made = gymnasium.make("tlf_env/Infinity-v0", render_mode="rgb_array", horizon_s=1.0)
-    env = gymnasium.wrappers.RecordVideo(made, str(tmp_path), disable_logger=True)
+
+def written(folder: Path) -> tuple[int, float, tuple[int, int]]:
+    """Frames, frames per second and size (px) of the one video in a folder."""
+    import imageio_ffmpeg
+
+    (path,) = folder.iterdir()
+    assert path.suffix == ".mp4"
+    frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    reader = imageio_ffmpeg.read_frames(str(path))
+    header = next(reader)
+    reader.close()
+    return frames, header["fps"], tuple(header["size"])
+
+
+def test_gymnasium_records_a_frame_of_the_start_and_of_every_step(tmp_path: Path) -> None:
+    folder = tmp_path / "videos"  # not there yet
+    made = gymnasium.make("tlf_env/Infinity-v0", render_mode="rgb_array", horizon_s=STEPS / FPS)
+    env = gymnasium.wrappers.RecordVideo(made, str(folder), disable_logger=True)
     env.reset(seed=0)
-    for _ in range(50):
+    height, width, _ = made.render().shape
+    for _ in range(STEPS):
         env.step(0 * env.action_space.sample())
     env.close()
-    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
+    assert written(folder) == (STEPS + 1, FPS, (width, height))
 
 
-def test_pettingzoo_records_a_video(tmp_path):
+def test_pettingzoo_records_a_frame_of_the_start_and_of_every_step(tmp_path: Path) -> None:
     from pettingzoo.utils.wrappers import RecordVideoParallel
 
-    made = tlf_env.parallel_env("flower", render_mode="rgb_array", horizon_s=1.0)
-    env = RecordVideoParallel(made, str(tmp_path))
+    folder = tmp_path / "videos"  # not there yet
+    made = tlf_env.parallel_env("flower", render_mode="rgb_array", horizon_s=STEPS / FPS)
+    env = RecordVideoParallel(made, str(folder))
     env.reset(seed=0)
+    height, width, _ = made.render().shape
     while env.agents:
         env.step({agent: 0 * env.action_space(agent).sample() for agent in env.agents})
     env.close()
-    assert [path.suffix for path in tmp_path.iterdir()] == [".mp4"]
+    assert written(folder) == (STEPS + 1, FPS, (width, height))

@@ -22,6 +22,7 @@ from tlf_env.onboard.parts import Factory, part_name, real_numbers
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.arrays import END_REASONS, Info, State
 from tlf_env.task.channels import PATHS
+from tlf_env.task.disturbance import PatchRow, patch_rows
 from tlf_env.task.formation import STATE_SCALES, Formation
 from tlf_env.task.judging import terminated, truncated
 from tlf_env.task.observation import OBSERVATION_LIMIT
@@ -68,7 +69,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     scenario
         A preset's name, a YAML file, a mapping or a :class:`~tlf_env.task.scenario.Scenario`.
     render_mode
-        None, ``"rgb_array"`` or ``"human"``.
+        None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, drawn by every
+        :meth:`reset` and :meth:`step`, no faster than the robots move).
     adversary
         Called with the environment before every step; returns ``{channel: value or one per robot}``
         to set for that step, e.g. ``{"slip.delta_1_mm_s": 20.0}``.
@@ -166,6 +168,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         ------
         ValueError
             for a seed out of its range, an unknown option or an impossible value of one.
+        ImportError
+            in mode ``human`` without pygame.
         """
         poses, phase_s = start_options(options or {}, self.scenario.robot_count)
         if seed is not None:
@@ -175,6 +179,10 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         else:
             self._episode += 1
         self._formation.reset(self._seed, self._episode, poses, phase_s)
+        if self._renderer is not None:
+            self._renderer.begin(self._path_mm())
+        if self.render_mode == "human":
+            self._draw(self.render_mode)
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos()
 
@@ -218,6 +226,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             for agent, reason in ends.items():
                 infos[agent]["end"] = reason
             self.agents = []
+        if self.render_mode == "human":
+            self._draw(self.render_mode)
         return observations, rewards, ended, cut, infos
 
     def _take(self, actions: dict[Agent, np.ndarray]) -> None:
@@ -291,6 +301,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     def render(self) -> np.ndarray | None:
         """A frame ``(height, width, 3)`` uint8 in mode ``rgb_array``; None in mode ``human``.
 
+        In mode ``human`` there is nothing left to do: :meth:`reset` and :meth:`step` have drawn.
+
         Raises
         ------
         RuntimeError
@@ -298,20 +310,33 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         """
         if self.render_mode is None or self._seed is None:
             raise RuntimeError("render() needs a render_mode and a reset() before")
-        from tlf_env.envs.rendering import Renderer, scene_of
+        return None if self.render_mode == "human" else self._draw(self.render_mode)
+
+    def _draw(self, mode: str) -> np.ndarray | None:
+        from tlf_env.envs.rendering import Renderer
+        from tlf_env.envs.scene import scene_of
 
         if self._renderer is None:
             self._renderer = Renderer(
                 self.scenario.robot_models,
-                self._formation.arrays.table[:, :2],
-                mode=self.render_mode,
+                self._path_mm(),
+                mode=mode,
                 fps=self.metadata["render_fps"],
                 patches=[
-                    patch.model_dump(exclude={"friction_scale"}) | {"scale": patch.friction_scale}
-                    for patch in self.scenario.disturbance.tyre.patches
+                    {
+                        "x_mm": patch.x,
+                        "y_mm": patch.y,
+                        "radius_mm": patch.radius,
+                        "scale": patch.scale,
+                    }
+                    for patch in map(PatchRow._make, patch_rows(self.scenario.disturbance).tolist())
+                    if patch.scale != 1  # else the floor there is as everywhere
                 ],
             )
         return self._renderer.draw(scene_of(self._formation))
+
+    def _path_mm(self) -> np.ndarray:
+        return self._formation.arrays.table[:, :2]
 
     def close(self) -> None:
         """Close the window, if there is one."""

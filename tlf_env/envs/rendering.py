@@ -7,72 +7,45 @@ from __future__ import annotations
 
 import math
 import os
-from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
-from tlf_env.onboard.observer import Reference
+from tlf_env.envs.drawing import BLOCK, FLOOR, INK, Place, Shapes, View, mixed
+from tlf_env.envs.looks import (
+    CASTOR_WIDTH_MM,
+    DRIVE_WHEEL_WIDTH_MM,
+    NOSE,
+    Colour,
+    robot_colours,
+)
+from tlf_env.envs.scene import Scene
 from tlf_env.physics.parameters import RobotParameters
-from tlf_env.physics.state import Contact, Motion
-from tlf_env.task.arrays import Info, State
-from tlf_env.task.formation import Formation
-
-Colour = tuple[int, int, int]
 
 RENDER_MODES = ("rgb_array", "human")
 OVERSAMPLING = 2
-SOFT_PX = 0.7  # of the canvas: how far a soft edge reaches
 DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and grow with it
 SMALLEST_PX = 64
 
-FLOOR: Colour = (252, 252, 250)
 GRID: Colour = (222, 224, 226)
 HALF_GRID: Colour = (239, 240, 241)
 PATH: Colour = (188, 190, 193)
-INK: Colour = (60, 62, 66)
 TYRE: Colour = (48, 50, 54)
 TREAD: Colour = (205, 208, 212)
 ALARM: Colour = (236, 0, 84)  # slip, lost, touched: no robot has it
 SLIPPERY: Colour = (214, 233, 246)
 GRIPPY: Colour = (247, 232, 210)
-# Okabe and Ito's colours but yellow; more robots go along viridis. The figures have the same.
-FEW_COLOURS: tuple[Colour, ...] = (
-    (0, 114, 178),
-    (230, 159, 0),
-    (0, 0, 0),
-    (86, 180, 233),
-    (213, 94, 0),
-    (0, 158, 115),
-    (204, 121, 167),
-)
-VIRIDIS = np.array(
-    [
-        (68, 1, 84),
-        (71, 44, 122),
-        (59, 81, 139),
-        (44, 113, 142),
-        (33, 144, 141),
-        (39, 173, 129),
-        (92, 200, 99),
-        (170, 220, 50),
-        (253, 231, 37),
-    ]
-)
-LIGHTEST = 0.92  # of the map; its end is lost on white
 
-DRIVE_WHEEL_WIDTH_MM, CASTOR_WIDTH_MM, AXLE_MM = 22.0, 14.0, 8.0  # for the picture only
+AXLE_MM = 8.0  # for the picture only
 TREADS, TREAD_RADII = 4, 0.2  # few: more would seem to turn backwards at top speed and 20 frames/s
-SLIP_SHOWN_MM_S, SLIP_FULL_MM_S = (
-    2.0,
-    60.0,
-)  # where a wheel's mark begins, and where it is strongest
+# Where a slipping wheel's mark begins, and where it is strongest.
+SLIP_SHOWN_MM_S, SLIP_FULL_MM_S = 2.0, 60.0
 
 ARM_RADII = 0.25  # arms of the reference's cross
 MARGIN_RADII = 3.0  # room around the path, in outline radii
 MOST_START_MM = 1500.0  # how far the view grows towards robots that start off the path
-STILL_MM = 1e-3  # who went less has no direction
-TRAIL_POINTS, BLOCK = 96, 6  # of one trail; pieces of one colour in it
+TRAIL_POINTS = 96  # of one trail
 PATH_POINTS = 1000
 TRAIL_PX, PATH_PX = 5.0, 2.0
 CLOSE_UP_PX, CLOSE_UP_RADII = 184, 3.2  # side of the close-up; how much floor, in outline radii
@@ -83,151 +56,6 @@ SMALLEST_TEXT, SMALLEST_CLOSE_UP = 0.6, 0.6  # of their size in the design
 TEXT_PX, TIME_PX = 19, 27  # of pygame's own font, whose letters are two thirds of that
 GRID_PX = 90  # least side of a grid square
 COLUMNS_PX = (18, 140, 208, 218)  # name, error, time gap, flags
-
-CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 37)) for f in (np.cos, np.sin)], axis=-1)
-NOSE = ((-0.26, 0.44), (0.26, 0.44), (0.0, 0.92))  # of what the outline is ahead of c
-
-
-class Scene(NamedTuple):
-    """Everything that one frame shows. A row of each array is a robot; units mm, rad, s.
-
-    Poses are those of the axle midpoint c; headings counter-clockwise from +y.
-    """
-
-    t_s: float
-    x_mm: np.ndarray
-    y_mm: np.ndarray
-    theta_rad: np.ndarray
-    castor_rad: np.ndarray  # fork angle relative to the body
-    wheel_angle_l_rad: np.ndarray
-    wheel_angle_r_rad: np.ndarray
-    reference_x_mm: np.ndarray  # each robot's own reference
-    reference_y_mm: np.ndarray
-    reference_theta_rad: np.ndarray
-    ghost_x_mm: np.ndarray  # the predecessor one gap ago; NaN where there is none
-    ghost_y_mm: np.ndarray
-    ghost_theta_rad: np.ndarray
-    slip_l_mm_s: np.ndarray
-    slip_r_mm_s: np.ndarray
-    slip_c_mm_s: np.ndarray
-    position_error_mm: np.ndarray
-    time_gap_error_s: np.ndarray
-    lost: np.ndarray  # bool
-    touched: np.ndarray  # bool
-
-
-def scene_of(formation: Formation) -> Scene:
-    """The scene of a formation as it is now: the truth, in fresh arrays."""
-    a = formation.arrays
-    motion = dict(zip(Motion._fields, a.motions[:, :, 0].copy(), strict=True))
-    contact = dict(zip(Contact._fields, a.contacts[:, :, 0].copy(), strict=True))
-    state = dict(zip(State._fields, formation.state().T, strict=True))
-    slot = formation.step_count % a.references.shape[1]
-    reference = dict(zip(Reference._fields, a.references[:, slot, :, 0].copy(), strict=True))
-    info = dict(zip(Info._fields, a.infos[0].T.copy(), strict=True))
-    ghost_x_mm, ghost_y_mm, ghost_theta_rad = _ghosts(formation, motion["theta"])
-    return Scene(
-        t_s=formation.time_s,
-        x_mm=state["x_mm"],
-        y_mm=state["y_mm"],
-        theta_rad=motion["theta"],
-        castor_rad=state["castor_rad"],
-        wheel_angle_l_rad=motion["angle_l"],
-        wheel_angle_r_rad=motion["angle_r"],
-        reference_x_mm=reference["x"],
-        reference_y_mm=reference["y"],
-        reference_theta_rad=reference["theta"],
-        ghost_x_mm=ghost_x_mm,
-        ghost_y_mm=ghost_y_mm,
-        ghost_theta_rad=ghost_theta_rad,
-        slip_l_mm_s=contact["slip_l"],
-        slip_r_mm_s=contact["slip_r"],
-        slip_c_mm_s=contact["slip_c"],
-        position_error_mm=info["position_error_mm"],
-        time_gap_error_s=info["time_gap_error_s"],
-        lost=a.lost[0].copy(),
-        touched=a.touched[0].copy(),
-    )
-
-
-def _ghosts(formation: Formation, theta: np.ndarray) -> np.ndarray:
-    """Pose of every robot's predecessor one gap ago, ``(3, robot)``.
-
-    Its heading is the direction it went; where it stood still, the one it has now.
-    """
-    paths = formation.arrays.paths[:, :, :-1, 0]  # of the predecessors
-    ghosts = np.full((3, len(theta)), np.nan)
-    step = formation.step_count - formation.scenario.gap_steps
-    if step < 0 or len(theta) == 1:
-        return ghosts
-    slots = paths.shape[1]
-    went_x, went_y = paths[:, (step + 1) % slots] - paths[:, max(step - 1, 0) % slots]
-    ghosts[:2, 1:] = paths[:, step % slots]
-    moved = np.hypot(went_x, went_y) > STILL_MM
-    ghosts[2, 1:] = np.where(moved, np.arctan2(-went_x, went_y), theta[:-1])
-    return ghosts
-
-
-def robot_colours(robots: int) -> list[Colour]:
-    """Colours that colour-blind eyes can tell apart, as in the figures of a run."""
-    if robots <= len(FEW_COLOURS):
-        return list(FEW_COLOURS[:robots])
-    along = LIGHTEST * np.linspace(0, len(VIRIDIS) - 1, robots)
-    channels = [np.interp(along, np.arange(len(VIRIDIS)), channel) for channel in VIRIDIS.T]
-    return [(round(r), round(g), round(b)) for r, g, b in zip(*channels, strict=True)]
-
-
-class View(NamedTuple):
-    """A window of the canvas and the floor in it; lengths in canvas px unless said."""
-
-    left: int
-    top: int
-    width: int
-    height: int
-    corner_mm: tuple[float, float]  # x of the left edge, y of the top edge
-    scale: float  # px per mm
-    pen: float  # px per px of the design
-
-    def px(self, points_mm: np.ndarray) -> np.ndarray:
-        """Canvas coordinates of points ``(..., 2)``; half a px on, since pygame cuts fractions off."""
-        offset = (self.left + 0.5, self.top + 0.5)
-        return (points_mm - self.corner_mm) * (self.scale, -self.scale) + offset
-
-    def place(self, x_mm: float, y_mm: float, theta_rad: float) -> Place:
-        """A pose on the canvas."""
-        x = self.left + (x_mm - self.corner_mm[0]) * self.scale
-        y = self.top + (self.corner_mm[1] - y_mm) * self.scale
-        return Place(x, y, theta_rad, self.scale)
-
-    def shows(self, px: np.ndarray, room: float = 0.0) -> np.ndarray:
-        """Which canvas points lie in the window or less than ``room`` beside it; NaN never does."""
-        x, y = px[..., 0] - self.left, px[..., 1] - self.top
-        return (x > -room) & (x < self.width + room) & (y > -room) & (y < self.height + room)
-
-    @property
-    def rect(self) -> tuple[int, int, int, int]:
-        """The window, as pygame takes rectangles."""
-        return self.left, self.top, self.width, self.height
-
-
-class Place(NamedTuple):
-    """A pose on the canvas and the scale there; its own axes are e (right) and f (forward), in mm."""
-
-    x: float  # canvas px, to the right
-    y: float  # canvas px, down
-    theta: float  # from up, counter-clockwise
-    scale: float  # px per mm
-
-    def px(self, points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
-        """Canvas coordinates of points (e, f)."""
-        sin, cos = self.scale * math.sin(self.theta), self.scale * math.cos(self.theta)
-        x, y = self.x, self.y
-        return [(x + e * cos - f * sin, y - e * sin - f * cos) for e, f in points]
-
-    def at(self, e: float, f: float, turn: float = 0.0) -> Place:
-        """A pose relative to this one."""
-        ((x, y),) = self.px([(e, f)])
-        return Place(x, y, self.theta + turn, self.scale)
 
 
 class Renderer:
@@ -285,20 +113,30 @@ class Renderer:
             [mixed(FLOOR, colour, part) for colour in self._colours]
             for part in np.linspace(0.15, 0.85, 32).tolist()
         ]
-        stride = max(1, len(path_mm) // PATH_POINTS)
-        self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
         self._patches = list(patches)
         self._fps, self._trail_s = fps, trail_s
         self._close_up = None if close_up is None else min(close_up, len(robots) - 1)
-        self._trail: list[tuple[float, np.ndarray]] = []  # time, (robot, 2)
-        self._background: Any = None
+        self.begin(path_mm)
         self._open, self._window = True, mode == "human"
         if self._window:
             self._open_window(size_px)
         self._resize(size_px)
 
+    def begin(self, path_mm: np.ndarray) -> None:
+        """Forget the last episode: trails and view are made anew from the next scene on.
+
+        Parameters
+        ----------
+        path_mm
+            The leader's whole reference in the episode that begins, ``(k, 2)``.
+        """
+        stride = max(1, len(path_mm) // PATH_POINTS)
+        self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
+        self._trail: list[tuple[float, np.ndarray]] = []  # time, (robot, 2)
+        self._background: Any = None
+
     def draw(self, scene: Scene) -> np.ndarray | None:
-        """Draw a scene; one whose time goes back begins a new episode.
+        """Draw a scene; one whose time goes back begins a new episode on the same path.
 
         Returns a fresh uint8 array ``(H, W, 3)`` in the mode ``"rgb_array"``, else None. Once closed,
         nothing happens.
@@ -337,10 +175,11 @@ class Renderer:
         self._unit = min(width / DESIGN_SIZE_PX[0], height / DESIGN_SIZE_PX[1])
         self._text_unit = max(self._unit, SMALLEST_TEXT)
         self._focus = self._close_up if self._unit >= SMALLEST_CLOSE_UP else None
-        self._font, self._time_font, self._canvas_font = (
+        self._font, self._time_font, canvas_font = (
             pg.font.Font(None, round(size * self._text_unit))
             for size in (TEXT_PX, TIME_PX, TEXT_PX * OVERSAMPLING)
         )
+        self._shapes = Shapes(pg, self._canvas, canvas_font)
         self._background = None
 
     def _pixels(self) -> np.ndarray:
@@ -423,14 +262,14 @@ class Renderer:
             for y in rows:
                 self._canvas.fill(colour, (view.left, y, view.width, OVERSAMPLING))
         width = np.full(len(self._path_mm), PATH_PX * view.pen)
-        self._draw_lines(view, self._path_mm[:, None], width, [[PATH]] * len(width))
+        self._shapes.lines(view, self._path_mm[:, None], width, [[PATH]] * len(width))
 
     def _draw_patch(self, view: View, patch: Mapping[str, float]) -> None:
         centre = view.place(patch["x_mm"], patch["y_mm"], 0.0)
         colour = SLIPPERY if patch["scale"] < 1 else GRIPPY
-        self._disc(centre, patch["radius_mm"] * view.scale, colour)
+        self._shapes.disc(centre, patch["radius_mm"] * view.scale, colour)
         if view is self._view:
-            self._label(f"µ × {patch['scale']:g}", colour, center=(centre.x, centre.y))
+            self._shapes.label(f"µ × {patch['scale']:g}", colour, center=(centre.x, centre.y))
 
     def _draw_scale_bar(self, view: View, length_mm: float) -> None:
         pen, length = self._view.pen, length_mm * view.scale
@@ -440,12 +279,7 @@ class Renderer:
         for end in (x, x + length - 2 * pen):
             self._canvas.fill(INK, (end, y - 4 * pen, 2 * pen, 8 * pen))
         text = f"{length_mm:g} mm" if length_mm < 1000 else f"{length_mm / 1000:g} m"
-        self._label(text, midbottom=(x + length / 2, y - 4 * pen))
-
-    def _label(self, text: str, ground: Colour = FLOOR, **anchor: Any) -> None:
-        """Text on the canvas; ``anchor`` as pygame names a rectangle's points."""
-        image = self._canvas_font.render(text, True, INK, ground)
-        self._canvas.blit(image, image.get_rect(**anchor))
+        self._shapes.label(text, midbottom=(x + length / 2, y - 4 * pen))
 
     # Robots
 
@@ -475,17 +309,19 @@ class Renderer:
         youth = 1 - age_s / self._trail_s
         shades = (youth[::BLOCK] * (len(self._faded) - 1)).astype(int).tolist()
         colours = [self._faded[shade] for shade in shades]
-        self._draw_lines(view, points, TRAIL_PX * view.pen * youth, colours)
+        self._shapes.lines(view, points, TRAIL_PX * view.pen * youth, colours)
 
     def _draw_robot(self, view: View, body: Place, scene: Scene, i: int) -> None:
         robot, colour, pen = self._robots[i], self._colours[i], view.pen
         centre, half = body.at(0, -robot.outline_offset_mm), robot.axle_width_mm / 2
         radius = view.scale * robot.outline_radius_mm
-        self._disc(centre, radius + 0.6 * pen, mixed(FLOOR, colour, 0.6))
-        self._disc(centre, radius - 0.6 * pen, mixed(FLOOR, colour, 0.25))
-        self._bar(body, (2 * half * view.scale, AXLE_MM * view.scale), mixed(FLOOR, colour, 0.6))
+        self._shapes.disc(centre, radius + 0.6 * pen, mixed(FLOOR, colour, 0.6))
+        self._shapes.disc(centre, radius - 0.6 * pen, mixed(FLOOR, colour, 0.25))
+        self._shapes.bar(
+            body, (2 * half * view.scale, AXLE_MM * view.scale), mixed(FLOOR, colour, 0.6)
+        )
         ahead = robot.outline_radius_mm - robot.outline_offset_mm
-        self._fill(body.px((ahead * e, ahead * f) for e, f in NOSE), colour)
+        self._shapes.fill(body.px((ahead * e, ahead * f) for e, f in NOSE), colour)
         fork = body.at(0, -robot.castor_pivot_mm, scene.castor_rad[i])
         castor = fork.at(0, -robot.castor_trail_mm)
         self._draw_tyre(view, castor, CASTOR_WIDTH_MM, robot.castor_radius_mm, scene.slip_c_mm_s[i])
@@ -497,9 +333,9 @@ class Renderer:
             self._draw_tyre(view, wheel, DRIVE_WHEEL_WIDTH_MM, robot.wheel_radius_mm, slip)
             self._draw_treads(wheel, robot.wheel_radius_mm, angle)
         if scene.touched[i]:
-            self._ring(centre, radius, 2.5 * pen, ALARM)
+            self._shapes.ring(centre, radius, 2.5 * pen, ALARM)
         if scene.lost[i]:
-            self._cross(centre.at(0, 0, math.pi / 4), 0.9 * radius, 2.5 * pen, ALARM)
+            self._shapes.cross(centre.at(0, 0, math.pi / 4), 0.9 * radius, 2.5 * pen, ALARM)
 
     def _draw_tyre(
         self, view: View, wheel: Place, width_mm: float, radius_mm: float, slip_mm_s: float
@@ -510,8 +346,10 @@ class Renderer:
         if slip_mm_s > SLIP_SHOWN_MM_S:
             strength = min(0.45 + 0.55 * slip_mm_s / SLIP_FULL_MM_S, 1.0)
             glow = 4.0 * view.pen
-            self._bar(wheel, (width + glow, length + glow), mixed(FLOOR, ALARM, 0.5 * strength))
-        self._bar(wheel, (width, length), mixed(TYRE, ALARM, strength))
+            self._shapes.bar(
+                wheel, (width + glow, length + glow), mixed(FLOOR, ALARM, 0.5 * strength)
+            )
+        self._shapes.bar(wheel, (width, length), mixed(TYRE, ALARM, strength))
 
     def _draw_treads(self, wheel: Place, radius_mm: float, angle: float) -> None:
         """The marks on the upper side of a wheel, foreshortened; rolling moves them forwards."""
@@ -520,20 +358,20 @@ class Renderer:
             if math.cos(turn) > 0.3:
                 thickness = TREAD_RADII * radius_mm * math.cos(turn) * wheel.scale
                 size = DRIVE_WHEEL_WIDTH_MM * wheel.scale, thickness
-                self._bar(wheel.at(0, radius_mm * math.sin(turn)), size, TREAD)
+                self._shapes.bar(wheel.at(0, radius_mm * math.sin(turn)), size, TREAD)
 
     def _draw_ghost(self, view: View, body: Place, scene: Scene, i: int) -> None:
         """The predecessor's outline one gap ago and a tick at its front, in the follower's colour."""
         robot, line = self._robots[i - 1], 1.3 * view.pen
         radius, offset = robot.outline_radius_mm, robot.outline_offset_mm
-        self._ring(body.at(0, -offset), radius * view.scale, line, self._colours[i])
+        self._shapes.ring(body.at(0, -offset), radius * view.scale, line, self._colours[i])
         front = body.at(0, 1.1 * radius - offset)
-        self._bar(front, (line, 0.2 * radius * view.scale), self._colours[i])
+        self._shapes.bar(front, (line, 0.2 * radius * view.scale), self._colours[i])
 
     def _draw_reference(self, view: View, place: Place, scene: Scene, i: int) -> None:
         """A cross, its arms along the reference's axes."""
         arm = ARM_RADII * self._robots[i].outline_radius_mm * view.scale
-        self._cross(place, arm, 1.2 * view.pen, INK)
+        self._shapes.cross(place, arm, 1.2 * view.pen, INK)
 
     def _draw_arrows(self, scene: Scene) -> None:
         """An arrow and a name at the edge for every robot that is outside."""
@@ -544,10 +382,10 @@ class Renderer:
             right, down = places[i] - size / 2
             x, y = np.clip(places[i], 5 * pen, size - 5 * pen).tolist()
             arrow = Place(x, y, math.atan2(-right, -down), pen)
-            self._fill(arrow.px([(0, 0), (-7, -16), (7, -16)]), self._colours[i])
+            self._shapes.fill(arrow.px([(0, 0), (-7, -16), (7, -16)]), self._colours[i])
             name = arrow.at(0, -28 - 22 * abs(math.sin(arrow.theta)))
             middle = min(max(name.x, 36 * pen), view.width - 36 * pen)
-            self._label(f"robot_{i}", center=(middle, name.y))
+            self._shapes.label(f"robot_{i}", center=(middle, name.y))
 
     # Close-up
 
@@ -574,7 +412,7 @@ class Renderer:
         self._draw_floor(view, step_mm)
         self._draw_robots(view, scene)
         self._draw_scale_bar(view, step_mm)
-        self._label(
+        self._shapes.label(
             f"robot_{i}", topleft=(view.left + 6 * self._view.pen, view.top + 6 * self._view.pen)
         )
         self._canvas.set_clip(None)
@@ -585,16 +423,16 @@ class Renderer:
         pen = self._view.pen
         x, y = (EDGE_PX + 8) * pen, self._view.height - (EDGE_PX + 2.3 * LINE_PX) * pen
         mark, below = Place(x, y, 0.0, 1.0), -LINE_PX * pen
-        self._cross(mark, 6 * pen, 1.3 * pen, INK)
-        self._label("reference", midleft=(x + 12 * pen, y))
+        self._shapes.cross(mark, 6 * pen, 1.3 * pen, INK)
+        self._shapes.label("reference", midleft=(x + 12 * pen, y))
         mark = mark.at(0, below)
-        self._bar(mark, (9 * pen, 14 * pen), mixed(FLOOR, ALARM, 0.5))
-        self._bar(mark, (5 * pen, 10 * pen), ALARM)
-        self._label("slipping wheel", midleft=(x + 12 * pen, mark.y))
+        self._shapes.bar(mark, (9 * pen, 14 * pen), mixed(FLOOR, ALARM, 0.5))
+        self._shapes.bar(mark, (5 * pen, 10 * pen), ALARM)
+        self._shapes.label("slipping wheel", midleft=(x + 12 * pen, mark.y))
         if len(self._robots) > 1:
             mark = mark.at(0, below)
-            self._ring(mark, 6 * pen, 1.5 * pen, self._colours[self._focus or 1])
-            self._label("predecessor one gap ago", midleft=(x + 12 * pen, mark.y))
+            self._shapes.ring(mark, 6 * pen, 1.5 * pen, self._colours[self._focus or 1])
+            self._shapes.label("predecessor one gap ago", midleft=(x + 12 * pen, mark.y))
 
     # Text
 
@@ -627,77 +465,11 @@ class Renderer:
             image = self._font.render(text, True, ALARM if column == COLUMNS_PX[-1] else INK)
             self._picture.blit(image, image.get_rect(**{side: (x + column * u, y)}))
 
-    # Shapes, lengths in canvas px
-
-    def _fill(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
-        """A polygon; pygame cuts fractions off."""
-        polygon = [(x + 0.5, y + 0.5) for x, y in points]
-        self._pg.draw.polygon(self._canvas, colour, polygon)
-
-    def _smooth(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
-        """A polygon with a soft edge around it, about 0.7 px wide."""
-        self._fill(points, colour)
-        self._pg.draw.aalines(self._canvas, colour, True, points)
-
-    def _bar(self, place: Place, size: tuple[float, float], colour: Colour) -> None:
-        """A rectangle around a place: its sides along e and f."""
-        e, f = (max(side / 2 - SOFT_PX, 0.3) / place.scale for side in size)
-        self._smooth(place.px([(-e, -f), (e, -f), (e, f), (-e, f)]), colour)
-
-    def _cross(self, place: Place, arm: float, width: float, colour: Colour) -> None:
-        self._bar(place, (2 * arm, width), colour)
-        self._bar(place, (width, 2 * arm), colour)
-
-    def _disc(self, place: Place, radius: float, colour: Colour) -> None:
-        points = (radius - SOFT_PX) * CIRCLE + (place.x, place.y)
-        self._smooth(points.tolist(), colour)
-
-    def _ring(self, place: Place, radius: float, width: float, colour: Colour) -> None:
-        """A circle's line as one polygon: round outside, and back inside."""
-        half, middle = max(width / 2 - SOFT_PX, 0.3), (place.x, place.y)
-        outside = ((radius + half) * CIRCLE + middle).tolist()
-        inside = ((radius - half) * CIRCLE[::-1] + middle).tolist()
-        self._smooth(outside + inside, colour)
-
-    def _draw_lines(
-        self,
-        view: View,
-        points_mm: np.ndarray,
-        width: np.ndarray,
-        colours: Sequence[Sequence[Colour]],
-    ) -> None:
-        """Lines through ``(point, line, 2)``, ``width`` wide at each point, first blocks first.
-
-        A block is ``BLOCK`` pieces long; ``colours`` holds one for each block and line.
-        """
-        points = view.px(points_mm)
-        along = np.gradient(points, axis=0)
-        length = np.linalg.norm(along, axis=-1, keepdims=True)
-        along = np.divide(along, length, out=np.zeros_like(along), where=length > 0)
-        side = along[..., ::-1] * (-0.5, 0.5) * width[:, None, None]
-        left, right = points + side, points - side
-        starts = np.arange(0, len(points) - 1, BLOCK)
-        near = np.logical_or.reduceat(view.shows(points, view.width / 2), starts)
-        possible = np.logical_and.reduceat(view.shows(points, 8 * view.width), starts)
-        for block, i in np.argwhere(near & possible).tolist():
-            here = slice(starts[block], starts[block] + BLOCK + 1)
-            outline = np.concatenate([left[here, i], right[here, i][::-1]]).tolist()
-            colour, half = colours[block][i], len(outline) // 2
-            self._fill(outline, colour)
-            self._pg.draw.aalines(self._canvas, colour, False, outline[:half])
-            self._pg.draw.aalines(self._canvas, colour, False, outline[half:])
-
 
 def round_length(least: float) -> float:
     """The smallest of 1, 2, 5, 10, 20 … that is at least this."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(digit * power for digit in (1, 2, 5, 10) if digit * power >= least)
-
-
-def mixed(of: Colour, with_: Colour, part: float) -> Colour:
-    """A colour between two others."""
-    r, g, b = (round(a + part * (c - a)) for a, c in zip(of, with_, strict=True))
-    return r, g, b
 
 
 def _grid_lines(view: View, step_mm: float, phase: float) -> tuple[list[int], list[int]]:

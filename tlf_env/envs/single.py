@@ -39,7 +39,8 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         an object with SB3's ``predict`` that takes ``tracking`` observations and gives ``twist``
         actions, or ``"module:factory"`` that makes one.
     render_mode
-        None, ``"rgb_array"`` or ``"human"``.
+        None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, drawn by every
+        :meth:`reset` and :meth:`step`, no faster than the robots move).
     **overrides
         Fields of the scenario; ``disturbance_level`` too.
 
@@ -143,7 +144,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self.formation_env.state()
 
     def render(self) -> np.ndarray | None:
-        """A frame in mode ``rgb_array``, None in mode ``human``."""
+        """A frame in mode ``rgb_array``; None in mode ``human``, where reset and step have drawn."""
         return self.formation_env.render()
 
     def close(self) -> None:
