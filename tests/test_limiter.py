@@ -16,9 +16,12 @@ from tlf_env.envs.single import FormationEnv
 from tlf_env.onboard.estimator import odometry
 from tlf_env.onboard.limiter import (
     TwistLimits,
+    braked,
     limited_twist,
     limits_row,
     saturated,
+    speed_range,
+    within,
 )
 from tlf_env.onboard.tracking import (
     CONTROLLERS,
@@ -47,6 +50,7 @@ PAPERS = [name for name in CONTROLLERS if name != "tuned"]
 speeds = st.floats(-2000, 2000)
 yaws = st.floats(-20, 20)
 twists = st.tuples(speeds, yaws)
+errors = st.floats(0, 1200)  # position, mm
 slips = st.tuples(st.floats(-60, 60), st.floats(-0.4, 0.4))
 
 
@@ -54,10 +58,10 @@ def place(name: str) -> int:
     return Tracking._fields.index(name)
 
 
-def step_now(last: tuple[float, float], slip: tuple[float, float]) -> float:
-    """Most that u₁ may change by in a step, mm/s: the less, the sharper the turn."""
-    used = min(abs((last[0] + slip[0]) * (last[1] + slip[1])) / ALL.lateral, 1.0)
-    return ALL.step_1 - ALL.turning_loss * used * used
+def range_now(last, slip, cruise: float, error: float) -> tuple[float, float]:
+    """Speeds (mm/s) of the wheels that may be asked for next."""
+    low, high = speed_range(last[0] + slip[0], last[1] + slip[1], cruise, error, ALL)
+    return low - slip[0], high - slip[0]
 
 
 def batch(rows: int = 64, seed: int = 0) -> np.ndarray:
@@ -68,10 +72,10 @@ def batch(rows: int = 64, seed: int = 0) -> np.ndarray:
 
 
 @untimed
-@given(twists, twists, slips, speeds)
-def test_without_limits_the_twist_is_left_bit_for_bit(u, last, slip, cruise):
-    assert limited_twist(*u, *last, *slip, cruise, NONE) == u
-    assert saturated(u[0], NONE.forward_error) == u[0]
+@given(twists, twists, slips, speeds, errors)
+def test_without_limits_the_twist_is_left_bit_for_bit(u, last, slip, cruise, error):
+    assert limited_twist(*u, *last, *slip, cruise, error, NONE) == u
+    assert braked(saturated(u[0], NONE.forward_error), NONE.braking_error) == u[0]
 
 
 @pytest.mark.parametrize("name", PAPERS)
@@ -90,12 +94,13 @@ def test_without_limits_the_policy_is_the_papers_law_bit_for_bit(name):
 
 
 @untimed
-@given(twists, twists, slips, speeds)
-def test_limits_hold(u, last, slip, cruise):
+@given(twists, twists, slips, speeds, errors)
+def test_limits_hold(u, last, slip, cruise, error):
     """Of the body's twist, the wheels' plus the slip."""
-    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
+    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, error, ALL)
     b_1, b_2 = v_1 + slip[0], v_2 + slip[1]
-    assert abs(v_1 - last[0]) <= step_now(last, slip) + 1e-9
+    low, high = range_now(last, slip, cruise, error)
+    assert low - 1e-9 <= v_1 <= high + 1e-9
     assert abs(b_1 * b_2) <= ALL.lateral * (1 + 1e-9) + 1e-9
     if abs(v_2 - last[1]) > ALL.step_2 + 1e-9:
         assert abs(b_1 * b_2) == pytest.approx(ALL.lateral, rel=1e-6)
@@ -103,46 +108,77 @@ def test_limits_hold(u, last, slip, cruise):
 
 
 @untimed
-@given(twists, twists, slips, speeds)
+@given(twists, twists, slips, speeds, errors)
 def test_catching_up_gives_way_before_turning_and_turning_before_the_references_speed(
-    u, last, slip, cruise
+    u, last, slip, cruise, error
 ):
-    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
-    unlimited = ALL._replace(step_1=step_now(last, slip), turning_loss=0.0, lateral=math.inf)
-    w_1, w_2 = limited_twist(*u, *last, *slip, cruise, unlimited)
-    fastest_brake = abs(last[0] + slip[0]) - unlimited.step_1
-    if abs(v_1 + slip[0]) < abs(w_1 + slip[0]) - 1e-9:  # slower, and no more than it had to be
+    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, error, ALL)
+    low, high = speed_range(last[0] + slip[0], last[1] + slip[1], cruise, error, ALL)
+    c_1 = min(max(u[0], low), high)  # as if the turn had no limit
+    c_2 = within(u[1], last[1] + slip[1], ALL.step_2)
+    slowest = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
+    if abs(v_1 + slip[0]) < abs(c_1) - 1e-9:  # slower, and no more than it had to be
         assert abs(v_1 + slip[0]) >= abs(cruise) - 1e-9
-    if abs(v_2 + slip[1]) < abs(w_2 + slip[1]) - 1e-9:  # turning gave way, for speed could not
-        assert abs(v_1 + slip[0]) <= max(abs(cruise), fastest_brake) + 1e-9
+    if abs(v_2 + slip[1]) < abs(c_2) - 1e-9:  # turning gave way, for speed could not
+        assert abs(v_1 + slip[0]) <= max(abs(cruise), slowest) + 1e-9
 
 
 @untimed
-@given(twists, twists, slips, speeds)
-def test_limiting_a_limited_twist_changes_nothing(u, last, slip, cruise):
-    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
-    again = limited_twist(v_1 + slip[0], v_2 + slip[1], *last, *slip, cruise, ALL)
+@given(twists, twists, slips, speeds, errors)
+def test_limiting_a_limited_twist_changes_nothing(u, last, slip, cruise, error):
+    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, error, ALL)
+    again = limited_twist(v_1 + slip[0], v_2 + slip[1], *last, *slip, cruise, error, ALL)
     assert again == pytest.approx((v_1, v_2), rel=1e-12, abs=1e-9)
 
 
 @untimed
-@given(st.floats(-100, 100), st.floats(-0.4, 0.4), slips, speeds)
-def test_what_is_within_the_limits_is_left_but_for_the_slip(u_1, u_2, slip, cruise):
+@given(st.floats(-100, 100), st.floats(-0.4, 0.4), slips, speeds, errors)
+def test_what_is_within_the_limits_is_left_but_for_the_slip(u_1, u_2, slip, cruise, error):
     last = u_1 - slip[0] + 0.5 * ALL.step_1, u_2 - slip[1] - 0.5 * ALL.step_2
-    assert limited_twist(u_1, u_2, *last, *slip, cruise, ALL) == (u_1 - slip[0], u_2 - slip[1])
+    assert limited_twist(u_1, u_2, *last, *slip, cruise, error, ALL) == (
+        u_1 - slip[0],
+        u_2 - slip[1],
+    )
 
 
 @untimed
-@given(twists, twists, slips, speeds)
-def test_limits_are_the_same_to_the_left_and_to_the_right_and_back_and_forth(u, last, slip, cruise):
-    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, ALL)
+@given(twists, twists, slips, speeds, errors)
+def test_limits_are_the_same_to_the_left_and_to_the_right_and_back_and_forth(
+    u, last, slip, cruise, error
+):
+    v_1, v_2 = limited_twist(*u, *last, *slip, cruise, error, ALL)
     for turn, way in ((-1.0, 1.0), (1.0, -1.0)):
         mirrored = [
             sign * value
             for pair in (u, last, slip)
             for sign, value in zip((way, turn), pair, strict=True)
         ]
-        assert limited_twist(*mirrored, cruise, ALL) == (way * v_1, turn * v_2)
+        assert limited_twist(*mirrored, way * cruise, error, ALL) == (way * v_1, turn * v_2)
+
+
+free = st.floats(-TUNED.free_speed_mm_s, TUNED.free_speed_mm_s)
+
+
+@untimed
+@given(free, free, slips, st.floats(0, 600))
+def test_about_the_references_speed_a_small_error_is_corrected_at_once(wish, last, slip, cruise):
+    wish, last = 0.999 * wish, 0.999 * last  # without rounding at the edges
+    v_1, _ = limited_twist(
+        cruise + wish, 0.0, cruise + last - slip[0], 0.0, *slip, cruise, 0.0, ALL
+    )
+    assert v_1 + slip[0] == pytest.approx(cruise + wish)
+
+
+@pytest.mark.parametrize("error", [0.0, 5.0, 1000.0])
+def test_catching_up_from_rest_is_limited_whatever_the_error(error):
+    v_1, _ = limited_twist(500.0, 0.0, 0.0, 0.0, 0.0, 0.0, 500.0, error, ALL)
+    assert v_1 == pytest.approx(ALL.step_1)
+
+
+def test_a_large_error_leaves_the_limit_on_the_acceleration():
+    cruise = 300.0
+    v_1, _ = limited_twist(600.0, 0.0, cruise, 0.0, 0.0, 0.0, cruise, 1000.0, ALL)
+    assert v_1 == pytest.approx(cruise + ALL.step_1)
 
 
 @untimed
@@ -152,7 +188,31 @@ def test_the_forward_error_saturates_smoothly(e, other):
     assert abs(saturated(e, most)) <= min(abs(e) + 1e-12, TUNED.forward_error_mm)
     assert saturated(-e, most) == -saturated(e, most)
     assert (saturated(e, most) - saturated(other, most)) * (e - other) >= 0
-    assert saturated(1.0, most) == pytest.approx(1.0, rel=1e-5)
+    assert saturated(1.0, most) == pytest.approx(1.0, rel=1e-4)
+
+
+@untimed
+@given(st.floats(-5000, 5000), st.floats(-5000, 5000), st.floats(1, 500))
+def test_an_error_that_is_braked_grows_as_its_root(e, other, linear):
+    assert abs(braked(e, linear)) <= abs(e)
+    assert braked(-e, linear) == -braked(e, linear)
+    assert (braked(e, linear) - braked(other, linear)) * (e - other) >= 0
+    if abs(e) <= linear:
+        assert braked(e, linear) == e
+    else:
+        assert braked(e, linear) ** 2 == pytest.approx(linear * (2 * abs(e) - linear))
+
+
+@pytest.mark.parametrize("k_1_per_s", [0.5, 1.2])
+def test_a_braked_error_falls_under_a_constant_deceleration(k_1_per_s):
+    """ė = −k₁·braked(e) from 700 mm: the speed falls by k₁²·w a second until e is w."""
+    linear, dt = 50.0, 1e-4
+    error, speeds = 700.0, []
+    while error > linear:
+        speeds.append(k_1_per_s * braked(error, linear))
+        error -= speeds[-1] * dt
+    decelerations = -np.diff(speeds) / dt
+    np.testing.assert_allclose(decelerations, k_1_per_s**2 * linear, rtol=1e-3)
 
 
 def test_limits_on_accelerations_are_per_second():
@@ -164,17 +224,17 @@ def test_limits_on_accelerations_are_per_second():
 
 def test_acceleration_at_the_lateral_limit_is_the_one_for_turns():
     last = (250.0, TUNED.lateral_acceleration_mm_s2 / 250.0)
-    v_1, _ = limited_twist(1000.0, last[1], *last, 0.0, 0.0, 1000.0, ALL)
+    v_1, _ = limited_twist(1000.0, last[1], *last, 0.0, 0.0, 1000.0, 0.0, ALL)
     assert v_1 - last[0] == pytest.approx(TUNED.turning_acceleration_mm_s2 * PERIOD_S)
-    straight, _ = limited_twist(1000.0, 0.0, 250.0, 0.0, 0.0, 0.0, 1000.0, ALL)
+    straight, _ = limited_twist(1000.0, 0.0, 250.0, 0.0, 0.0, 0.0, 1000.0, 0.0, ALL)
     assert straight - 250.0 == pytest.approx(TUNED.acceleration_mm_s2 * PERIOD_S)
 
 
 @pytest.mark.parametrize("field", [name for name in TwistLimits.model_fields if "_mm" in name])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
 def test_impossible_limits_are_refused(field, value):
-    if field == "reverse_mm_s" and value == 0.0:
-        assert TwistLimits(reverse_mm_s=value).reverse_mm_s == 0.0
+    if field in ("reverse_mm_s", "free_speed_mm_s") and value == 0.0:
+        assert getattr(TwistLimits(**{field: value}), field) == 0.0
         return
     with pytest.raises(ValueError, match=field):
         TwistLimits(**{field: value})
@@ -195,11 +255,18 @@ def test_limits_hold_on_every_command_of_an_episode(disturbance):
     last, at_limit = np.zeros((2, 3)), np.zeros(3, dtype=int)
     for _ in range(scenario.horizon_steps):
         slip = a.slip_estimates[:2, :, 0].copy()
+        seen = a.observations[0] * SCALES
+        cruise, error = seen[:, place("reference_u_1")], np.hypot(*seen[:, :2].T)
+        ranges = [
+            range_now(last[:, r], slip[:, r], cruise[r], error[r]) for r in range(last.shape[1])
+        ]
+        low, high = np.transpose(ranges)
         a.actions[0] = policy.predict(a.observations[0])[0]
         formation.step()
         twist = np.array(odometry.py_func(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h))
         step, lateral = np.abs(twist - last), np.abs(np.prod(twist + slip, axis=0))
-        assert (step[0] <= ALL.step_1 + 1e-3).all()
+        assert (twist[0] >= low - 1e-3).all()
+        assert (twist[0] <= high + 1e-3).all()
         assert (lateral <= ALL.lateral + 0.05).all()
         gives_way = step[1] > ALL.step_2 + 1e-5
         assert (lateral[gives_way] >= ALL.lateral - 0.05).all()
@@ -237,7 +304,7 @@ def test_a_residual_stays_within_the_limits_of_its_base():
         a.actions[0] = rng.uniform(-1, 1, a.actions[0].shape)
         formation.step()
         u_1, u_2 = odometry.py_func(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h)
-        assert (np.abs(u_1 - last) <= ALL.step_1 + 1e-3).all()
+        assert (np.abs(u_1 - last) <= ALL.step_1 + 2 * ALL.free + 1e-3).all()
         assert (np.abs(u_1 * u_2) <= ALL.lateral + 0.05).all()
         last = u_1
 

@@ -27,7 +27,16 @@ from tlf_env.task.scenario import load_scenario
 
 DT = 0.001
 PRESET = SlipEkfParameters()
-CHOSEN = slip_ekf_constants(PRESET, DT)
+# Without what it learns: a Kalman filter, to be held against one.
+STEADY = PRESET.model_copy(
+    update={
+        "fix_variance_mm2": PRESET.fix_variance_factor * PRESET.fix_variance_mm2,
+        "fix_variance_time_s": None,
+        "fix_variance_factor": 1.0,
+        "surprise_threshold": None,
+    }
+)
+CHOSEN = slip_ekf_constants(STEADY, DT)
 FREE = CHOSEN._replace(bound_1=math.inf, bound_2=math.inf)
 CONFIDENCE = 0.999
 LAGS = 20
@@ -44,7 +53,14 @@ def packed(state, P: np.ndarray | None = None) -> Both:
     P = np.zeros((5, 5)) if P is None else P
     pose = P[:3, :3][np.triu_indices(3)].tolist()
     slip = [*P[:3, 3], *P[:3, 4], P[3, 3], P[3, 4], P[4, 4]]
-    return Estimate(x, y, theta, *pose), SlipEstimate(delta_1, delta_2, *map(float, slip))
+    learned = (0.0,) * (len(SlipEstimate._fields) - 2 - len(slip))
+    return Estimate(x, y, theta, *pose), SlipEstimate(delta_1, delta_2, *map(float, slip), *learned)
+
+
+def steady(*noise: float, variance: float, bounds: tuple[float, float]) -> SlipEkf:
+    """A filter that learns nothing: process noise per sample, variance of a fix (mm²), bounds of slip."""
+    constants = CHOSEN._replace(variance=variance, least=0.0, bound_1=bounds[0], bound_2=bounds[1])
+    return constants._replace(**dict(zip(SlipEkf._fields[:5], noise, strict=True)))
 
 
 def state_of(e: Estimate, z: SlipEstimate) -> np.ndarray:
@@ -128,7 +144,8 @@ def test_single_steps_are_those_of_the_matrix_filter_to_rounding():
     for _ in range(300):
         state = [*rng.uniform(-3000, 3000, 2), *rng.uniform(-4, 4, 1), *rng.normal(size=2)]
         dt, P = rng.uniform(1e-3, 0.05), random_covariance(rng)
-        ekf = SlipEkf(*rng.uniform(0, 1, 5), rng.uniform(0.1, 5), math.inf, math.inf)
+        noise, variance = rng.uniform(0, 1, 5), rng.uniform(0.1, 5)
+        ekf = steady(*noise, variance=variance, bounds=(math.inf, math.inf))
         u_1, u_2 = rng.uniform(-10, 10), rng.uniform(-0.2, 0.2)
         matrix = MatrixFilter(state, P, ekf, dt)
         matrix.predict(u_1, u_2)
@@ -166,7 +183,7 @@ def test_covariance_is_propagated_with_the_derivative_of_the_motion(
 ):
     """Without noise P' = F P Fᵀ, F by differences of the motion."""
     dt = 0.02
-    silent = SlipEkf(0.0, 0.0, 0.0, 0.0, 0.0, 1.0, math.inf, math.inf)
+    silent = steady(0.0, 0.0, 0.0, 0.0, 0.0, variance=1.0, bounds=(math.inf, math.inf))
     state = np.array([0.0, 0.0, theta, delta_1, delta_2])
     P = random_covariance(np.random.default_rng(2))
     F = jacobian(state, u_1, u_2, dt)
@@ -183,7 +200,7 @@ def test_without_doubt_about_slip_it_is_a_filter_of_the_pose():
     u_1, u_2 = 0.4, 6e-4
     paper = Ekf(2e-3, 1e-2, 0.0, 0.0, 0.2)  # noise of eq. (36) forward alone
     forward = (paper.alpha_1 * u_1 + paper.alpha_2 * u_2) ** 2
-    ekf = SlipEkf(forward, 0.0, 0.0, 0.0, 0.0, 0.2, 60.0, 0.4)
+    ekf = steady(forward, 0.0, 0.0, 0.0, 0.0, variance=0.2, bounds=(60.0, 0.4))
     P = np.zeros((5, 5))
     P[:3, :3] = random_covariance(rng)[:3, :3]
     law = packed([1.0, 2.0, 0.3, 0.0, 0.0], P)
@@ -196,7 +213,7 @@ def test_without_doubt_about_slip_it_is_a_filter_of_the_pose():
         pose, _, _, expected = correct(predict(pose, paper, u_1, u_2), paper, *map(float, fix))
         np.testing.assert_allclose(law[0], pose, rtol=1e-9, atol=1e-12)
         assert nis == pytest.approx(expected, rel=1e-9)
-    assert set(law[1]) == {0.0}
+    assert set(law[1][:11]) == {0.0}
 
 
 BOUNDS = PRESET.delta_1_bound_mm_s, PRESET.delta_2_bound_rad_s
@@ -258,7 +275,7 @@ def test_the_scenario_sets_the_filters_numbers():
 @pytest.mark.parametrize("dt", [0.0005, 0.001, 0.005, 0.02])
 def test_doubt_grows_per_second_and_not_per_sample(dt):
     """Standing for a second without a fix: random walks, and their integrals."""
-    ekf = slip_ekf_constants(PRESET, dt)
+    ekf = slip_ekf_constants(STEADY, dt)
     law = packed(np.zeros(5))
     for _ in range(round(1 / dt)):
         law = predict_with_slip(*law, ekf, 0.0, 0.0, dt)
@@ -278,8 +295,8 @@ def test_doubt_settles_at_the_same_level_if_fixes_tell_as_much_per_second(dt):
     """Fewer fixes, each better by as much."""
 
     def settled(period: float) -> np.ndarray:
-        known = PRESET.model_copy(
-            update={"fix_variance_mm2": PRESET.fix_variance_mm2 * DT / period}
+        known = STEADY.model_copy(
+            update={"fix_variance_mm2": STEADY.fix_variance_mm2 * DT / period}
         )
         ekf = slip_ekf_constants(known, period)
         law = packed(np.zeros(5))
@@ -288,7 +305,7 @@ def test_doubt_settles_at_the_same_level_if_fixes_tell_as_much_per_second(dt):
             *law, _, _, _ = correct_with_slip(e, z, ekf, e.x, e.y)
         return np.diag(covariance(*law))
 
-    np.testing.assert_allclose(settled(dt), settled(DT), rtol=0.05)
+    np.testing.assert_allclose(settled(dt), settled(DT), rtol=0.1)
 
 
 # Consistency where the filter's own model holds
@@ -300,7 +317,7 @@ class Simulated:
     """Runs of robots that move as the filter believes, and what the filter made of them."""
 
     def __init__(self) -> None:
-        rng, ekf = np.random.default_rng(6), slip_ekf_constants(PRESET, SAMPLE_S)
+        rng, ekf = np.random.default_rng(6), slip_ekf_constants(STEADY, SAMPLE_S)
         ekf = ekf._replace(bound_1=math.inf, bound_2=math.inf)
         spreads = np.sqrt(ekf[:5])
         self.innovations = np.empty((RUNS, SAMPLES, 2))  # forward and right, mm
@@ -365,6 +382,87 @@ def test_innovations_are_white_where_the_model_holds(simulated, axis):
     assert np.abs(correlations).max() < bound
 
 
+# What it learns
+
+LEARNING = slip_ekf_constants(PRESET, DT)
+
+
+class Straight:
+    """A robot at 400 mm/s along y for ``duration_s``; slip sets in after ``before_s``."""
+
+    def __init__(
+        self,
+        ekf: SlipEkf,
+        noise_mm: float,
+        slip: tuple[float, float] = (0.0, 0.0),
+        duration_s: float = 6.0,
+        before_s: float = 4.0,
+    ) -> None:
+        rng = np.random.default_rng(7)
+        truth, law = np.zeros(5), packed(np.zeros(5))
+        estimates = []
+        for k in range(round(duration_s / DT)):
+            truth[3:] = slip if k * DT >= before_s else (0.0, 0.0)
+            truth = motion(truth, 400.0 * DT, 0.0, DT)
+            fix = truth[:2] + noise_mm * rng.normal(size=2)
+            law = predict_with_slip(*law, ekf, 400.0 * DT, 0.0, DT)
+            *law, _, _, _ = correct_with_slip(*law, ekf, *map(float, fix))
+            estimates.append(law[1])
+        self.estimates = np.array(estimates)
+
+    def of(self, field: str) -> np.ndarray:
+        return self.estimates[:, SlipEstimate._fields.index(field)]
+
+
+@pytest.mark.parametrize("noise_mm", [0.2**0.5, 2.0, 5.0])
+def test_the_variance_of_the_fixes_is_learned(noise_mm):
+    """To a fifth; a mean over 0.5 s of two coordinates at 1 kHz is off by 4 % as a rule."""
+    found = PRESET.fix_variance_mm2 + Straight(LEARNING, noise_mm, (30.0, 0.2)).of("variance")
+    np.testing.assert_allclose(found[3000:], noise_mm**2, rtol=0.2)
+
+
+def test_a_variance_that_is_not_learned_stays():
+    fixed = slip_ekf_constants(PRESET.model_copy(update={"fix_variance_time_s": None}), DT)
+    assert set(Straight(fixed, 2.0).of("variance")) == {0.0}
+
+
+def first_within(run: Straight, field: str, value: float, share: float) -> float:
+    """When (s) an estimate last was further from its new value than a share of it."""
+    wrong = np.abs(run.of(field) - value) > share * abs(value)
+    return (np.flatnonzero(wrong)[-1] + 1) * DT
+
+
+@pytest.mark.parametrize(("field", "slip"), [("delta_1", (40.0, 0.0)), ("delta_2", (0.0, 0.3))])
+def test_slip_that_sets_in_is_found_sooner_with_surprise(field, slip):
+    never = slip_ekf_constants(PRESET.model_copy(update={"surprise_threshold": None}), DT)
+    value = max(slip)
+    sooner = first_within(Straight(LEARNING, 0.2**0.5, slip, 9.0), field, value, 0.3) - 4.0
+    later = first_within(Straight(never, 0.2**0.5, slip, 9.0), field, value, 0.3) - 4.0
+    assert 0.0 < sooner < 0.8 * later
+
+
+@pytest.mark.parametrize("noise_mm", [0.2**0.5, 2.0])
+def test_quiet_motion_is_hardly_a_surprise(noise_mm):
+    """Once the variance is learned, hardly more doubt about slip than without surprise."""
+    never = slip_ekf_constants(PRESET.model_copy(update={"surprise_threshold": None}), DT)
+    surprised = Straight(LEARNING, noise_mm).of("p_22")[2000:]
+    calm = Straight(never, noise_mm).of("p_22")[2000:]
+    assert surprised.mean() < 1.05 * calm.mean()
+    assert np.mean(surprised > 1.2 * calm) < 0.05
+
+
+def test_who_stands_is_never_surprised():
+    """Yaw slip does not show in the fixes of a robot at rest, so they say nothing about it."""
+    e, z = packed(np.zeros(5), random_covariance(np.random.default_rng(8)))
+    z = z._replace(ahead=50.0, aside=50.0)
+    still = predict_with_slip(e, z, LEARNING, 0.0, 0.0, DT)
+    calm = predict_with_slip(e, z._replace(ahead=0.0, aside=0.0), LEARNING, 0.0, 0.0, DT)
+    np.testing.assert_array_equal(covariance(*still), covariance(*calm))
+    moving = predict_with_slip(e, z, LEARNING, 400.0 * DT, 0.0, DT)
+    assert moving[1].p_11 > still[1].p_11
+    assert moving[1].p_22 > still[1].p_22
+
+
 # On the plant, in the loop. The filter expects noisier fixes than the nominal ones, and slip that wanders.
 
 
@@ -411,7 +509,7 @@ def test_constant_slip_on_the_plant_is_found_within_the_stated_accuracy(slip):
 
 def test_the_filter_believes_the_same_at_every_sampling_rate():
     slow, fast = (Loop((10.0, 0.1), period) for period in (0.002, 0.001))
-    np.testing.assert_allclose(slow.deviations[-1], fast.deviations[-1], rtol=0.05)
+    np.testing.assert_allclose(slow.deviations[-1], fast.deviations[-1], rtol=0.1)
     np.testing.assert_allclose(
         slow.slips[400:].mean(axis=0), fast.slips[400:].mean(axis=0), atol=0.1
     )

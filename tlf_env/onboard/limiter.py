@@ -19,10 +19,15 @@ class TwistLimits(Frozen):
 
     forward_error_mm: Positive | None = None  # e₁ enters as E·tanh(e₁/E)
     lateral_error_mm: Positive | None = None  # e₂ likewise
+    braking_error_mm: Positive | None = None  # before that, e₁ beyond w becomes √(w(2e₁ − w))
     acceleration_mm_s2: Positive | None = None  # of u₁
     yaw_acceleration_rad_s2: Positive | None = None  # of u₂
     lateral_acceleration_mm_s2: Positive | None = None  # of |u₁ u₂|
     turning_acceleration_mm_s2: Positive | None = None  # of u₁ where |u₁ u₂| is at its limit
+    # Where the position error is well below the reach, u₁ changes at once within so much of the reference's
+    # speed.
+    free_speed_mm_s: NonNegative = 0.0
+    free_reach_mm: Positive = 30.0
     reverse_mm_s: NonNegative | None = None  # of u₁ backward
     cancel_slip: bool = False  # take the estimated slip off the wheels' twist
 
@@ -32,10 +37,13 @@ class Limits(NamedTuple):
 
     forward_error: float
     lateral_error: float
+    braking_error: float
     step_1: float  # mm/s per control step
     step_2: float  # rad/s per control step
     lateral: float
     turning_loss: float  # mm/s per control step, what step_1 loses where |u₁ u₂| is at its limit
+    free: float  # mm/s
+    free_reach: float  # mm
     reverse: float  # mm/s
     slip: float  # 1 if the estimated slip counts, else 0
 
@@ -51,10 +59,13 @@ def limits_row(limits: TwistLimits, period_s: float) -> Limits:
     return Limits(
         finite(limits.forward_error_mm),
         finite(limits.lateral_error_mm),
+        finite(limits.braking_error_mm),
         finite(limits.acceleration_mm_s2, period_s),
         finite(limits.yaw_acceleration_rad_s2, period_s),
         finite(limits.lateral_acceleration_mm_s2),
         turning_loss * period_s,
+        limits.free_speed_mm_s,
+        limits.free_reach_mm,
         finite(limits.reverse_mm_s),
         1.0 if limits.cancel_slip else 0.0,
     )
@@ -69,9 +80,41 @@ def saturated(error: float, most: float) -> float:
 
 
 @law
+def braked(error: float, linear: float) -> float:
+    """A forward error, mm, such that the speed k₁·error can be braked away on the way that is left.
+
+    Beyond ``linear`` it grows as the root, with one slope where they meet: e₁ then falls under a constant
+    deceleration, k₁² times ``linear``.
+    """
+    if abs(error) <= linear:
+        return error
+    return math.copysign(math.sqrt(linear * (2.0 * abs(error) - linear)), error)
+
+
+@law
 def within(value: float, centre: float, reach: float) -> float:
     """``value`` held within ``centre`` ± ``reach``."""
     return min(max(value, centre - reach), centre + reach)
+
+
+@law
+def speed_range(
+    b_1: float, b_2: float, cruise: float, error: float, limits: Limits
+) -> tuple[float, float]:
+    """Speeds (mm/s) that the body may be asked for next, if ``b`` is what its last command comes to.
+
+    In a turn the motors have less left to accelerate with: the limit falls with the square of |b₁ b₂|. A
+    small correction of a small error, about the reference's speed ``cruise``, needs no limit; catching up
+    does, for it asks for all that the motors have.
+    """
+    used = min(abs(b_1 * b_2) / limits.lateral, 1.0)
+    step = limits.step_1 - limits.turning_loss * used * used
+    low, high = b_1 - step, b_1 + step
+    far = error / limits.free_reach
+    free = limits.free / (1.0 + far * far * far * far)
+    if abs(b_1 - cruise) <= free:
+        low, high = min(low, cruise - free), max(high, cruise + free)
+    return low, high
 
 
 @law
@@ -83,24 +126,23 @@ def limited_twist(
     delta_1: float,
     delta_2: float,
     cruise: float,
+    error: float,
     limits: Limits,
 ) -> tuple[float, float]:
     """Twist for the wheels (mm/s, rad/s) if the body shall have ``u``.
 
-    In a turn the motors have less left to accelerate with: the limit on it falls with the square of
-    |u₁ u₂|. ``last`` is the wheels' twist of the step before, ``delta`` the estimated slip, ``cruise`` the
-    reference's speed (mm/s). Where speed and yaw rate together are too much, what is beyond the
-    reference's speed gives way first, and then the yaw rate.
+    ``last`` is the wheels' twist of the step before, ``delta`` the estimated slip, ``cruise`` the
+    reference's speed (mm/s), ``error`` the estimated position error (mm). Where speed and yaw rate together
+    are too much, what is beyond the reference's speed gives way first, and then the yaw rate.
     """
     s_1, s_2 = limits.slip * delta_1, limits.slip * delta_2
     b_2 = within(u_2, last_2 + s_2, limits.step_2)
-    used = min(abs((last_1 + s_1) * (last_2 + s_2)) / limits.lateral, 1.0)
-    step_1 = limits.step_1 - limits.turning_loss * used * used
-    b_1 = within(u_1, last_1 + s_1, step_1)
+    low, high = speed_range(last_1 + s_1, last_2 + s_2, cruise, error, limits)
+    b_1 = min(max(u_1, low), high)
     if abs(b_1 * b_2) > limits.lateral:
         enough = max(limits.lateral / abs(b_2), abs(cruise))
         if abs(b_1) > enough:
-            b_1 = within(math.copysign(enough, b_1), last_1 + s_1, step_1)
+            b_1 = min(max(math.copysign(enough, b_1), low), high)
     if abs(b_1 * b_2) > limits.lateral:
         b_2 = math.copysign(limits.lateral / abs(b_1), b_2)
     return b_1 - s_1, b_2 - s_2

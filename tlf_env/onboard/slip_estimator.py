@@ -3,10 +3,15 @@
 The wheels tell how far they rolled; the floor may move the robot on top of that, forward with δ₁ and
 in yaw with δ₂. Both are taken as random walks and are seen through the position fixes. The process
 noise is a variance per second, so that the filter is the same at every sampling rate.
+
+It learns two things while it runs. How noisy the fixes are: from the differences of successive
+innovations, which hardly see what else is wrong. And whether slip has just changed: then the innovations
+no longer average out, and the walks are widened until they do.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law, reader, writer
@@ -18,14 +23,27 @@ from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 class SlipEkfParameters(Frozen):
     """Noise of the filter, and the bounds that its slip estimates are held within."""
 
-    forward_noise_mm2_s: NonNegative = 13.6  # of the position along the heading
-    sideways_noise_mm2_s: NonNegative = 0.75
-    heading_noise_rad2_s: NonNegative = 2.2e-4
-    delta_1_walk_mm2_s3: NonNegative = 206.0
-    delta_2_walk_rad2_s3: NonNegative = 0.0068
-    fix_variance_mm2: Positive = 2.1
-    delta_1_bound_mm_s: NonNegative = 47.0
-    delta_2_bound_rad_s: NonNegative = 0.43
+    forward_noise_mm2_s: NonNegative = 19.0  # of the position along the heading
+    sideways_noise_mm2_s: NonNegative = 0.09
+    heading_noise_rad2_s: NonNegative = 2.8e-5
+    delta_1_walk_mm2_s3: NonNegative = 850.0
+    delta_2_walk_rad2_s3: NonNegative = 0.016
+    fix_variance_mm2: Positive = 0.2  # of each coordinate; where the filter begins
+    fix_variance_time_s: Positive | None = 0.5  # over which it is learned; None: it stays
+    least_fix_variance_mm2: Positive = 0.05
+    fix_variance_factor: Positive = 4.0  # of what was learned, for what this model leaves out
+    delta_1_bound_mm_s: NonNegative = 55.0
+    delta_2_bound_rad_s: NonNegative = 0.4
+    # Surprise: innovations averaged over this time, squared, against what fixes alone explain. It sets in
+    # at the threshold and grows by 1 with every threshold more; None: never. At 1 this much process noise is
+    # added. It fades with the square of the speed below surprise_speed_mm_s: who stands cannot tell yaw.
+    surprise_time_s: Positive = 0.05
+    surprise_threshold: Positive | None = 7.0
+    most_surprise: NonNegative = 5.0
+    surprise_speed_mm_s: Positive = 300.0
+    heading_surprise_rad2_s: NonNegative = 3.4e-4
+    delta_1_surprise_mm2_s3: NonNegative = 28000.0
+    delta_2_surprise_rad2_s3: NonNegative = 0.05
 
 
 class SlipEkf(NamedTuple):
@@ -39,10 +57,23 @@ class SlipEkf(NamedTuple):
     variance: float
     bound_1: float
     bound_2: float
+    learning: float  # share of a sample in the learned variance
+    least: float
+    factor: float
+    averaging: float  # share of a sample in the mean innovation
+    threshold: float  # of the mean innovation's square, per variance of a fix
+    most_surprise: float
+    fast: float  # mm per sample from which on surprise counts whole
+    surprise_heading: float
+    surprise_1: float
+    surprise_2: float
 
 
 class SlipEstimate(NamedTuple):
-    """Estimated δ₁ (mm/s), δ₂ (rad/s), and what their rows add to the covariance's upper triangle."""
+    """Estimated δ₁ (mm/s), δ₂ (rad/s), what their rows add to the covariance's upper triangle.
+
+    And what was learned from the innovations.
+    """
 
     delta_1: float
     delta_2: float
@@ -55,6 +86,11 @@ class SlipEstimate(NamedTuple):
     p_11: float
     p_12: float
     p_22: float
+    variance: float  # of a fix, beyond where the filter began, mm²
+    d_x: float  # last innovation, world axes, mm
+    d_y: float
+    ahead: float  # mean innovation, forward and right, mm
+    aside: float
 
 
 read_slip_ekf = reader(SlipEkf)
@@ -62,8 +98,14 @@ read_slip_estimate = reader(SlipEstimate)
 write_slip_estimate = writer(SlipEstimate)
 
 
+def share(dt_s: float, time_s: float) -> float:
+    """Weight of one sample in a mean over ``time_s``."""
+    return -math.expm1(-dt_s / time_s)
+
+
 def slip_ekf_constants(p: SlipEkfParameters, dt_s: float) -> SlipEkf:
     """The filter's numbers for a sampling period of ``dt_s`` s, as the compiled law takes them."""
+    averaging = share(dt_s, p.surprise_time_s)
     return SlipEkf(
         p.forward_noise_mm2_s * dt_s,
         p.sideways_noise_mm2_s * dt_s,
@@ -73,7 +115,28 @@ def slip_ekf_constants(p: SlipEkfParameters, dt_s: float) -> SlipEkf:
         p.fix_variance_mm2,
         p.delta_1_bound_mm_s,
         p.delta_2_bound_rad_s,
+        0.0 if p.fix_variance_time_s is None else share(dt_s, p.fix_variance_time_s),
+        p.least_fix_variance_mm2,
+        p.fix_variance_factor,
+        averaging,
+        math.inf
+        if p.surprise_threshold is None
+        else p.surprise_threshold * averaging / (2.0 - averaging),
+        p.most_surprise,
+        p.surprise_speed_mm_s * dt_s,
+        p.heading_surprise_rad2_s * dt_s,
+        p.delta_1_surprise_mm2_s3 * dt_s,
+        p.delta_2_surprise_rad2_s3 * dt_s,
     )
+
+
+@law
+def surprise(mean: float, variance: float, ekf: SlipEkf) -> float:
+    """How much more a mean innovation (mm) is than what fixes of this variance (mm²) explain.
+
+    White innovations of variance V have a mean, with the share a of each sample, of variance V·a/(2 − a).
+    """
+    return min(max(mean * mean / (ekf.threshold * variance) - 1.0, 0.0), ekf.most_surprise)
 
 
 @law
@@ -83,6 +146,10 @@ def predict_with_slip(
     """Pose, slip and covariance one sample on, for increments u₁ (mm) and u₂ (rad) of the wheels."""
     moved, turned = u_1 + z.delta_1 * dt, u_2 + z.delta_2 * dt
     middle = e.theta + 0.5 * turned
+    noise = max(ekf.variance + z.variance, ekf.least)
+    speed = min(abs(u_1) / ekf.fast, 1.0)
+    forward = speed * speed * surprise(z.ahead, noise, ekf)
+    sideways = speed * speed * surprise(z.aside, noise, ekf)
     sin, cos = sincos(middle)
     # F = I but for ∂(x, y)/∂θ = f, ∂(x, y)/∂δ₁ = h, ∂(x, y)/∂δ₂ = g, ∂θ/∂δ₂ = dt.
     f_x, f_y = -moved * cos, -moved * sin
@@ -116,7 +183,7 @@ def predict_with_slip(
             + (f_y * m_yt + h_y * m_y1 + g_y * m_y2)
             + (cos * cos * ekf.forward + sin * sin * ekf.sideways),
             m_yt + dt * m_y2,
-            m_tt + dt * m_t2 + ekf.heading,
+            m_tt + dt * m_t2 + ekf.heading + ekf.surprise_heading * sideways,
         ),
         SlipEstimate(
             z.delta_1,
@@ -127,9 +194,14 @@ def predict_with_slip(
             m_x2,
             m_y2,
             m_t2,
-            z.p_11 + ekf.walk_1,
+            z.p_11 + ekf.walk_1 + ekf.surprise_1 * forward,
             z.p_12,
-            z.p_22 + ekf.walk_2,
+            z.p_22 + ekf.walk_2 + ekf.surprise_2 * sideways,
+            z.variance,
+            z.d_x,
+            z.d_y,
+            z.ahead,
+            z.aside,
         ),
     )
 
@@ -142,8 +214,13 @@ def correct_with_slip(
 
     Returns the estimates, the innovation in world axes (mm), and its normalised square (NIS).
     """
-    i_xx, i_xy, i_yy = certainty(e, ekf.variance)
+    known = ekf.variance + z.variance
+    i_xx, i_xy, i_yy = certainty(e, max(ekf.factor * known, ekf.least))
     d_x, d_y = x - e.x, y - e.y
+    # Successive innovations differ by twice the variance of a fix; a slow error cancels.
+    step_x, step_y = d_x - z.d_x, d_y - z.d_y
+    sin, cos = sincos(e.theta)
+    ahead, aside = cos * d_y - sin * d_x, cos * d_x + sin * d_y
     # Gain l = P Hᵀ S⁻¹, rows x, y, θ, δ₁, δ₂.
     l_xx, l_xy = e.p_xx * i_xx + e.p_xy * i_xy, e.p_xx * i_xy + e.p_xy * i_yy
     l_yx, l_yy = e.p_xy * i_xx + e.p_yy * i_xy, e.p_xy * i_xy + e.p_yy * i_yy
@@ -176,6 +253,11 @@ def correct_with_slip(
             z.p_11 - l_1x * z.p_x1 - l_1y * z.p_y1,
             z.p_12 - l_1x * z.p_x2 - l_1y * z.p_y2,
             z.p_22 - l_2x * z.p_x2 - l_2y * z.p_y2,
+            z.variance + ekf.learning * (0.25 * (step_x * step_x + step_y * step_y) - known),
+            d_x,
+            d_y,
+            z.ahead + ekf.averaging * (ahead - z.ahead),
+            z.aside + ekf.averaging * (aside - z.aside),
         ),
         d_x,
         d_y,

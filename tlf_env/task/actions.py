@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from tlf_env.numerics.compiled import law
-from tlf_env.onboard.limiter import limited_twist, saturated
+from tlf_env.onboard.limiter import braked, limited_twist, saturated
 from tlf_env.onboard.spacing import Heard, spaced_twist
 from tlf_env.onboard.tracking import ControllerRow, tracking_twist
 from tlf_env.physics.parameters import Body
@@ -86,7 +86,10 @@ def wanted_twist(
         u_1 += row.lead * (observation[LATER_U_1] * scales[LATER_U_1] - u_1)
         u_2 += row.lead * (observation[LATER_U_2] * scales[LATER_U_2] - u_2)
     return tracking_twist(
-        saturated(observation[E_1] * scales[E_1], row.limits.forward_error),
+        saturated(
+            braked(observation[E_1] * scales[E_1], row.limits.braking_error),
+            row.limits.forward_error,
+        ),
         saturated(observation[E_2] * scales[E_2], row.limits.lateral_error),
         observation[SIN_E_3] * scales[SIN_E_3],
         observation[COS_E_3] * scales[COS_E_3],
@@ -126,6 +129,7 @@ def twist_action(
         observation[SLIP_1] * scales[SLIP_1],
         observation[SLIP_2] * scales[SLIP_2],
         observation[U_1] * scales[U_1],
+        math.hypot(observation[E_1] * scales[E_1], observation[E_2] * scales[E_2]),
         row.limits,
     )
     return limited(v_1 / FULL_SPEED_MM_S), limited(v_2 / FULL_YAW_RATE_RAD_S)

@@ -217,7 +217,7 @@ def sense_robot(
     elif kind == TRUTH:
         ahead, yaw = forward_and_yaw(motion)
         rolled, spun = odometry(motion.omega_l, motion.omega_r, body.R, body.h)
-        certain = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+        certain = (0.0,) * 14
         slip = SlipEstimate(ahead - rolled, yaw - spun, *certain)
         estimate = Estimate(true_x, true_y, motion.theta, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     forward, right = body_errors(d_x, d_y, estimate.theta)
