@@ -22,6 +22,7 @@ class TwistLimits(Frozen):
     braking_error_mm: Positive | None = None  # before that, e₁ beyond w becomes √(w(2e₁ − w))
     acceleration_mm_s2: Positive | None = None  # of u₁
     yaw_acceleration_rad_s2: Positive | None = None  # of u₂
+    yaw_rate_rad_s: Positive | None = None  # of |u₂|
     lateral_acceleration_mm_s2: Positive | None = None  # of |u₁ u₂|
     turning_acceleration_mm_s2: Positive | None = None  # of u₁ where |u₁ u₂| is at its limit
     # Where the position error is well below the reach, u₁ changes at once within so much of the reference's
@@ -40,6 +41,7 @@ class Limits(NamedTuple):
     braking_error: float
     step_1: float  # mm/s per control step
     step_2: float  # rad/s per control step
+    yaw_rate: float  # rad/s
     lateral: float
     turning_loss: float  # mm/s per control step, what step_1 loses where |u₁ u₂| is at its limit
     free: float  # mm/s
@@ -62,6 +64,7 @@ def limits_row(limits: TwistLimits, period_s: float) -> Limits:
         finite(limits.braking_error_mm),
         finite(limits.acceleration_mm_s2, period_s),
         finite(limits.yaw_acceleration_rad_s2, period_s),
+        finite(limits.yaw_rate_rad_s),
         finite(limits.lateral_acceleration_mm_s2),
         turning_loss * period_s,
         limits.free_speed_mm_s,
@@ -136,7 +139,7 @@ def limited_twist(
     are too much, what is beyond the reference's speed gives way first, and then the yaw rate.
     """
     s_1, s_2 = limits.slip * delta_1, limits.slip * delta_2
-    b_2 = within(u_2, last_2 + s_2, limits.step_2)
+    b_2 = within(within(u_2, 0.0, limits.yaw_rate), last_2 + s_2, limits.step_2)
     low, high = speed_range(last_1 + s_1, last_2 + s_2, cruise, error, limits)
     b_1 = min(max(u_1, low), high)
     if abs(b_1 * b_2) > limits.lateral:

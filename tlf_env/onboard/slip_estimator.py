@@ -31,7 +31,7 @@ class SlipEkfParameters(Frozen):
     fix_variance_mm2: Positive = 0.2  # of each coordinate; where the filter begins
     fix_variance_time_s: Positive | None = 0.5  # over which it is learned; None: it stays
     least_fix_variance_mm2: Positive = 0.05
-    fix_variance_factor: Positive = 4.0  # of what was learned, for what this model leaves out
+    fix_variance_factor: Positive = 5.6  # of what was learned, for what this model leaves out
     delta_1_bound_mm_s: NonNegative = 55.0
     delta_2_bound_rad_s: NonNegative = 0.4
     # Surprise: innovations averaged over this time, squared, against what fixes alone explain. It sets in

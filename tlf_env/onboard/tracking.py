@@ -81,6 +81,7 @@ CONTROLLERS: dict[str, Controller] = {
             acceleration_mm_s2=185.0,
             turning_acceleration_mm_s2=150.0,
             yaw_acceleration_rad_s2=22.0,
+            yaw_rate_rad_s=1.5,
             lateral_acceleration_mm_s2=173.0,
             free_speed_mm_s=58.0,
             free_reach_mm=27.0,
