@@ -236,14 +236,14 @@ def test_scattered_starts_lose_the_filter_and_not_the_law():
 # RMS position error of the worst robot in the last 30 %, mm: the largest of seeds 0 to 2. The test
 # allows 1.5 times as much.
 TUNED_RMS_MM = {
-    "nominal": 0.9,
-    "slip": 28.5,
-    "noise": 4.3,
-    "ice": 0.8,
-    "start": 0.9,
-    "combined-hard": 12.3,
-    "radio": 3.6,
-    "actuator": 1.6,
+    "nominal": 0.7,
+    "slip": 6.8,
+    "noise": 1.2,
+    "ice": 0.4,
+    "start": 0.7,
+    "combined-hard": 4.9,
+    "radio": 2.0,
+    "actuator": 1.0,
 }
 
 

@@ -1,0 +1,93 @@
+"""What each part of `tuned` does: leave one out, drive ∞ anew, put the tables into ``docs/controller.md``.
+
+``python docs/figures/make_parts.py`` drives 50 seeds of each disturbance for 60 s; it takes some minutes
+and needs no extra.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from make_board import DOCS, with_part, write_text
+
+from baselines import ReferencePolicy
+from baselines.run import run_seeds
+from tlf_env.onboard.tracking import controller
+from tlf_env.task.scenario import load_scenario
+
+HORIZON_S = 60.0
+SEEDS = range(2_000, 2_050)
+DISTURBANCES = ("nominal", "noise", "slip", "start", "combined-hard", "ice", "payload")
+TUNED = controller("tuned")
+WITHOUT_LEARNING = {
+    "fix_variance_time_s": None,
+    "fix_variance_mm2": 2.1,
+    "fix_variance_factor": 1.0,
+}
+WITHOUT_SURPRISE = {"surprise_threshold": None}
+FILTERS: dict[str, dict[str, Any]] = {
+    "whole": {},
+    "without surprise": {"ekf_slip": WITHOUT_SURPRISE},
+    "variance of a fix fixed, 2.1 mm²": {"ekf_slip": WITHOUT_LEARNING},
+    "without either": {"ekf_slip": {**WITHOUT_LEARNING, **WITHOUT_SURPRISE}},
+    "the true pose and slip": {"estimator": "truth"},
+}
+LIMITS: dict[str, dict[str, Any]] = {
+    "as in the table": {},
+    "no $w$": {"braking_error_mm": None},
+    "$F$ = 0": {"free_speed_mm_s": 0.0},
+    "$R$ = 100 mm": {"free_reach_mm": 100.0},
+    "no $\\Omega$": {"yaw_rate_rad_s": None},
+    "no $A_1$, $A_3$": {"acceleration_mm_s2": None, "turning_acceleration_mm_s2": None},
+    "$A_\\perp$ = 230 mm/s²": {"lateral_acceleration_mm_s2": 230.0},
+}
+
+
+def cell(policy: ReferencePolicy, disturbance: str, fields: dict[str, Any]) -> str:
+    """The worst robot's position RMS (mm), median over seeds, and how many runs lost a robot."""
+    fields = {"estimator": "ekf-slip", **fields}
+    scenario = load_scenario(
+        "infinity", disturbance=disturbance, horizon_s=HORIZON_S, plant="batch", **fields
+    )
+    runs = [record.metrics() for record in run_seeds(scenario, policy, SEEDS)]
+    rms_mm = np.median([max(robot.position_rmse_mm for robot in run) for run in runs])
+    lost = sum(any(robot.lost or robot.touched for robot in run) for run in runs)
+    return f"{rms_mm:.1f} ({lost})" if lost else f"{rms_mm:.1f}"
+
+
+def table(rows: dict[str, tuple[ReferencePolicy, dict[str, Any]]]) -> str:
+    """A row for each variant, a column for each disturbance."""
+    lines = ["| | " + " | ".join(f"`{name}`" for name in DISTURBANCES) + " |"]
+    lines.append("|---" + "|---:" * len(DISTURBANCES) + "|")
+    for name, (policy, fields) in rows.items():
+        cells = [cell(policy, disturbance, fields) for disturbance in DISTURBANCES]
+        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+        print(lines[-1], flush=True)
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Write both tables."""
+    page = DOCS / "controller.md"
+    tuned = ReferencePolicy(TUNED)
+    filters = table({name: (tuned, fields) for name, fields in FILTERS.items()})
+    limits = table(
+        {
+            name: (
+                ReferencePolicy(
+                    TUNED.model_copy(update={"limits": TUNED.limits.model_copy(update=change)})
+                ),
+                {},
+            )
+            for name, change in LIMITS.items()
+        }
+    )
+    text = page.read_text(encoding="utf-8")
+    text = with_part(text, filters, "<!-- filter -->", "<!-- end of filter -->", page.name)
+    text = with_part(text, limits, "<!-- limits -->", "<!-- end of limits -->", page.name)
+    write_text(page, text)
+
+
+if __name__ == "__main__":
+    main()
