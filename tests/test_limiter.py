@@ -115,7 +115,7 @@ def test_catching_up_gives_way_before_turning_and_turning_before_the_references_
     v_1, v_2 = limited_twist(*u, *last, *slip, cruise, error, ALL)
     low, high = speed_range(last[0] + slip[0], last[1] + slip[1], cruise, error, ALL)
     c_1 = min(max(u[0], low), high)  # as if the turn had no limit
-    c_2 = within(u[1], last[1] + slip[1], ALL.step_2)
+    c_2 = within(within(u[1], 0.0, ALL.yaw_rate), last[1] + slip[1], ALL.step_2)
     slowest = 0.0 if low <= 0.0 <= high else min(abs(low), abs(high))
     if abs(v_1 + slip[0]) < abs(c_1) - 1e-9:  # slower, and no more than it had to be
         assert abs(v_1 + slip[0]) >= abs(cruise) - 1e-9
@@ -173,6 +173,11 @@ def test_about_the_references_speed_a_small_error_is_corrected_at_once(wish, las
 def test_catching_up_from_rest_is_limited_whatever_the_error(error):
     v_1, _ = limited_twist(500.0, 0.0, 0.0, 0.0, 0.0, 0.0, 500.0, error, ALL)
     assert v_1 == pytest.approx(ALL.step_1)
+
+
+def test_the_yaw_rate_has_a_limit_of_its_own():
+    _, v_2 = limited_twist(10.0, 5.0, 10.0, ALL.yaw_rate, 0.0, 0.0, 10.0, 0.0, ALL)
+    assert v_2 == ALL.yaw_rate
 
 
 def test_a_large_error_leaves_the_limit_on_the_acceleration():

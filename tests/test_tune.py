@@ -31,8 +31,18 @@ from tlf_env.cli import main
 from tlf_env.onboard.tracking import CONTROLLERS, controller
 from tlf_env.task.scenario import load_scenario, presets_folder
 
+# A start of its own: the preset may change.
+GAINS = {
+    "k_1_per_s": 0.55,
+    "k_2_mm2_s": 6.4 * 1.76e4,
+    "k_3_mm2": 1.76e4,
+    "eta": 1e-4,
+    "epsilon": 0.05,
+}
+START = {**controller("tuned").model_dump(), "gains": GAINS}
+
 SMALL = {
-    "start": "tuned",
+    "start": START,
     "search": {
         "gains.k_1_per_s": {"low": 0.2, "high": 2, "log": True},
         "gains.k_2_mm2_s": {"low": 0.8, "high": 12, "log": True, "times": "gains.k_3_mm2"},
