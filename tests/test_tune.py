@@ -468,7 +468,7 @@ def test_the_committed_result_is_of_the_committed_search():
 
 def test_a_search_may_say_its_start_in_numbers():
     numbers = CONTROLLERS["tuned"].model_dump()
-    assert config(start=numbers) == config()
+    assert config(start=numbers) == config(start="tuned")
 
 
 def test_a_ratio_follows_what_it_is_of():
