@@ -33,15 +33,28 @@ FILTERS: dict[str, dict[str, Any]] = {
     "without either": {"ekf_slip": {**WITHOUT_LEARNING, **WITHOUT_SURPRISE}},
     "the true pose and slip": {"estimator": "truth"},
 }
-LIMITS: dict[str, dict[str, Any]] = {
+LAWS: dict[str, dict[str, Any]] = {
     "as in the table": {},
-    "no $w$": {"braking_error_mm": None},
-    "$F$ = 0": {"free_speed_mm_s": 0.0},
-    "$R$ = 100 mm": {"free_reach_mm": 100.0},
-    "no $\\Omega$": {"yaw_rate_rad_s": None},
-    "no $A_1$, $A_3$": {"acceleration_mm_s2": None, "turning_acceleration_mm_s2": None},
-    "$A_\\perp$ = 230 mm/s²": {"lateral_acceleration_mm_s2": 230.0},
+    "no $w$": {"limits": {"braking_error_mm": None}},
+    "$F$ = 0": {"limits": {"free_speed_mm_s": 0.0}},
+    "$R$ = 100 mm": {"limits": {"free_reach_mm": 100.0}},
+    "no $\\Omega$": {"limits": {"yaw_rate_rad_s": None}},
+    "no $A_1$, $A_3$": {"limits": {"acceleration_mm_s2": None, "turning_acceleration_mm_s2": None}},
+    "$A_\\perp$ = 230 mm/s²": {"limits": {"lateral_acceleration_mm_s2": 230.0}},
+    "$\\eta$ = 0.4, $\\epsilon$ = 1000": {"gains": {"eta": 0.4, "epsilon": 1000.0}},
 }
+
+
+def changed(change: dict[str, dict[str, Any]]) -> ReferencePolicy:
+    """`tuned` with some numbers of its gains or limits changed."""
+    return ReferencePolicy(
+        TUNED.model_copy(
+            update={
+                part: getattr(TUNED, part).model_copy(update=numbers)
+                for part, numbers in change.items()
+            }
+        )
+    )
 
 
 def cell(policy: ReferencePolicy, disturbance: str, fields: dict[str, Any]) -> str:
@@ -72,20 +85,10 @@ def main() -> None:
     page = DOCS / "controller.md"
     tuned = ReferencePolicy(TUNED)
     filters = table({name: (tuned, fields) for name, fields in FILTERS.items()})
-    limits = table(
-        {
-            name: (
-                ReferencePolicy(
-                    TUNED.model_copy(update={"limits": TUNED.limits.model_copy(update=change)})
-                ),
-                {},
-            )
-            for name, change in LIMITS.items()
-        }
-    )
+    laws = table({name: (changed(change), {}) for name, change in LAWS.items()})
     text = page.read_text(encoding="utf-8")
     text = with_part(text, filters, "<!-- filter -->", "<!-- end of filter -->", page.name)
-    text = with_part(text, limits, "<!-- limits -->", "<!-- end of limits -->", page.name)
+    text = with_part(text, laws, "<!-- limits -->", "<!-- end of limits -->", page.name)
     write_text(page, text)
 
 
