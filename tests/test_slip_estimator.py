@@ -18,10 +18,12 @@ from tlf_env.onboard.slip_estimator import (
     SlipEkfParameters,
     SlipEstimate,
     correct_with_slip,
+    jumps,
     predict_with_slip,
     slip_ekf_constants,
 )
 from tlf_env.onboard.tracking import body_errors
+from tlf_env.task.channels import PATHS
 from tlf_env.task.formation import Formation
 from tlf_env.task.scenario import load_scenario
 
@@ -34,6 +36,8 @@ STEADY = PRESET.model_copy(
         "fix_variance_time_s": None,
         "fix_variance_factor": 1.0,
         "surprise_threshold": None,
+        "most_acceleration_mm_s2": None,
+        "most_yaw_acceleration_rad_s2": None,
     }
 )
 CHOSEN = slip_ekf_constants(STEADY, DT)
@@ -55,6 +59,13 @@ def packed(state, P: np.ndarray | None = None) -> Both:
     slip = [*P[:3, 3], *P[:3, 4], P[3, 3], P[3, 4], P[4, 4]]
     learned = (0.0,) * (len(SlipEstimate._fields) - 2 - len(slip))
     return Estimate(x, y, theta, *pose), SlipEstimate(delta_1, delta_2, *map(float, slip), *learned)
+
+
+def predicted(
+    e: Estimate, z: SlipEstimate, ekf: SlipEkf, u_1: float, u_2: float, dt: float
+) -> Both:
+    """One sample on, of wheels that turn as they did in the last one."""
+    return predict_with_slip(e, z._replace(u_1=u_1, u_2=u_2), ekf, u_1, u_2, u_1, u_2, dt)
 
 
 def steady(*noise: float, variance: float, bounds: tuple[float, float]) -> SlipEkf:
@@ -149,7 +160,7 @@ def test_single_steps_are_those_of_the_matrix_filter_to_rounding():
         u_1, u_2 = rng.uniform(-10, 10), rng.uniform(-0.2, 0.2)
         matrix = MatrixFilter(state, P, ekf, dt)
         matrix.predict(u_1, u_2)
-        law = predict_with_slip(*packed(state, P), ekf, u_1, u_2, dt)
+        law = predicted(*packed(state, P), ekf, u_1, u_2, dt)
         np.testing.assert_allclose(state_of(*law), matrix.x, rtol=1e-12, atol=1e-12)
         np.testing.assert_allclose(covariance(*law), matrix.P, rtol=1e-11, atol=1e-12)
         fix = matrix.x[:2] + rng.normal(0, 2, 2)
@@ -168,7 +179,7 @@ def test_filter_is_the_matrix_filter_over_a_run():
     for _ in range(1000):
         u_1, u_2 = rng.uniform(-0.6, 0.6), rng.uniform(-0.005, 0.005)
         fix = matrix.x[:2] + rng.normal(0, 2, 2)
-        law = predict_with_slip(*law, FREE, u_1, u_2, DT)
+        law = predicted(*law, FREE, u_1, u_2, DT)
         matrix.predict(u_1, u_2)
         *law, _, _, _ = correct_with_slip(*law, FREE, *map(float, fix))
         matrix.correct(fix)
@@ -187,7 +198,7 @@ def test_covariance_is_propagated_with_the_derivative_of_the_motion(
     state = np.array([0.0, 0.0, theta, delta_1, delta_2])
     P = random_covariance(np.random.default_rng(2))
     F = jacobian(state, u_1, u_2, dt)
-    law = predict_with_slip(*packed(state, P), silent, u_1, u_2, dt)
+    law = predicted(*packed(state, P), silent, u_1, u_2, dt)
     np.testing.assert_allclose(covariance(*law), F @ P @ F.T, rtol=1e-6, atol=1e-6)
 
 
@@ -208,7 +219,7 @@ def test_without_doubt_about_slip_it_is_a_filter_of_the_pose():
     for _ in range(1000):
         fix = pose.x + rng.normal(), pose.y + rng.normal()
         *law, _, _, nis = correct_with_slip(
-            *predict_with_slip(*law, ekf, u_1, u_2, DT), ekf, *map(float, fix)
+            *predicted(*law, ekf, u_1, u_2, DT), ekf, *map(float, fix)
         )
         pose, _, _, expected = correct(predict(pose, paper, u_1, u_2), paper, *map(float, fix))
         np.testing.assert_allclose(law[0], pose, rtol=1e-9, atol=1e-12)
@@ -240,7 +251,7 @@ def test_bounds_hold_the_slip_and_leave_the_rest_of_the_estimate():
 def test_covariance_stays_positive_semidefinite(steps, theta):
     law = packed([0.0, 0.0, theta, 0.0, 0.0])
     for u_1, u_2, d_x, d_y in steps:
-        e, z = predict_with_slip(*law, CHOSEN, u_1, u_2, DT)
+        e, z = predicted(*law, CHOSEN, u_1, u_2, DT)
         *law, _, _, nis = correct_with_slip(e, z, CHOSEN, e.x + d_x, e.y + d_y)
         scale = np.sqrt(np.maximum(np.diag(covariance(*law)), 1e-30))
         eigenvalues = np.linalg.eigvalsh(covariance(*law) / np.outer(scale, scale))
@@ -278,7 +289,7 @@ def test_doubt_grows_per_second_and_not_per_sample(dt):
     ekf = slip_ekf_constants(STEADY, dt)
     law = packed(np.zeros(5))
     for _ in range(round(1 / dt)):
-        law = predict_with_slip(*law, ekf, 0.0, 0.0, dt)
+        law = predicted(*law, ekf, 0.0, 0.0, dt)
     P = covariance(*law)
     assert P[3, 3] == pytest.approx(PRESET.delta_1_walk_mm2_s3, rel=1e-9)
     assert P[4, 4] == pytest.approx(PRESET.delta_2_walk_rad2_s3, rel=1e-9)
@@ -302,7 +313,7 @@ def test_doubt_settles_at_the_same_level_if_fixes_tell_as_much_per_second(dt):
         ekf = slip_ekf_constants(known, period)
         law = packed(np.zeros(5))
         for _ in range(round(20 / period)):
-            e, z = predict_with_slip(*law, ekf, 300.0 * period, 0.3 * period, period)
+            e, z = predicted(*law, ekf, 300.0 * period, 0.3 * period, period)
             *law, _, _, _ = correct_with_slip(e, z, ekf, e.x, e.y)
         return np.diag(covariance(*law))
 
@@ -338,7 +349,7 @@ class Simulated:
                 truth[:2] += -sin * forward + cos * sideways, cos * forward + sin * sideways
                 truth[2:] += rest
                 fix = truth[:2] + math.sqrt(ekf.variance) * rng.normal(size=2)
-                law = predict_with_slip(*law, ekf, u_1, u_2, SAMPLE_S)
+                law = predicted(*law, ekf, u_1, u_2, SAMPLE_S)
                 heading = law[0].theta
                 *law, d_x, d_y, self.nis[run, k] = correct_with_slip(
                     *law, ekf, float(fix[0]), float(fix[1])
@@ -406,7 +417,7 @@ class Straight:
             truth[3:] = slip if k * DT >= before_s else (0.0, 0.0)
             truth = motion(truth, 400.0 * DT, 0.0, DT)
             fix = truth[:2] + noise_mm * rng.normal(size=2)
-            law = predict_with_slip(*law, ekf, 400.0 * DT, 0.0, DT)
+            law = predicted(*law, ekf, 400.0 * DT, 0.0, DT)
             *law, _, _, _ = correct_with_slip(*law, ekf, *map(float, fix))
             estimates.append(law[1])
         self.estimates = np.array(estimates)
@@ -428,16 +439,16 @@ def test_a_variance_that_is_not_learned_stays():
 
 
 def first_within(run: Straight, field: str, value: float, share: float) -> float:
-    """When (s) an estimate last was further from its new value than a share of it."""
-    wrong = np.abs(run.of(field) - value) > share * abs(value)
-    return (np.flatnonzero(wrong)[-1] + 1) * DT
+    """When (s) an estimate first came within a share of its new value."""
+    near = np.abs(run.of(field) - value) < share * abs(value)
+    return np.flatnonzero(near)[0] * DT
 
 
 @pytest.mark.parametrize(
-    ("field", "slip", "share"), [("delta_1", (40.0, 0.0), 0.8), ("delta_2", (0.0, 0.3), 1.0)]
+    ("field", "slip", "share"), [("delta_1", (40.0, 0.0), 0.8), ("delta_2", (0.0, 0.3), 0.8)]
 )
 def test_slip_that_sets_in_is_found_sooner_with_surprise(field, slip, share):
-    """Forward slip by a fifth or more, yaw slip by a little: its walk is wide anyway."""
+    """By a fifth or more."""
     never = slip_ekf_constants(PRESET.model_copy(update={"surprise_threshold": None}), DT)
     value = max(slip)
     sooner = first_within(Straight(LEARNING, 0.2**0.5, slip, 9.0), field, value, 0.3) - 4.0
@@ -447,24 +458,163 @@ def test_slip_that_sets_in_is_found_sooner_with_surprise(field, slip, share):
 
 @pytest.mark.parametrize("noise_mm", [0.2**0.5, 2.0])
 def test_quiet_motion_is_hardly_a_surprise(noise_mm):
-    """Once the variance is learned, hardly more doubt about slip than without surprise."""
+    """Once the variance is learned, a tenth more doubt about slip than without surprise at most.
+
+    It is not white innovations that are averaged: a filter that trusts its fixes little colours them.
+    """
     never = slip_ekf_constants(PRESET.model_copy(update={"surprise_threshold": None}), DT)
     surprised = Straight(LEARNING, noise_mm).of("p_22")[2000:]
     calm = Straight(never, noise_mm).of("p_22")[2000:]
-    assert surprised.mean() < 1.05 * calm.mean()
-    assert np.mean(surprised > 1.2 * calm) < 0.05
+    assert surprised.mean() < 1.1 * calm.mean()
+    assert np.mean(surprised > 1.2 * calm) < 0.1
 
 
 def test_who_stands_is_never_surprised():
     """Yaw slip does not show in the fixes of a robot at rest, so they say nothing about it."""
     e, z = packed(np.zeros(5), random_covariance(np.random.default_rng(8)))
     z = z._replace(ahead=50.0, aside=50.0)
-    still = predict_with_slip(e, z, LEARNING, 0.0, 0.0, DT)
-    calm = predict_with_slip(e, z._replace(ahead=0.0, aside=0.0), LEARNING, 0.0, 0.0, DT)
+    still = predicted(e, z, LEARNING, 0.0, 0.0, DT)
+    calm = predicted(e, z._replace(ahead=0.0, aside=0.0), LEARNING, 0.0, 0.0, DT)
     np.testing.assert_array_equal(covariance(*still), covariance(*calm))
-    moving = predict_with_slip(e, z, LEARNING, 400.0 * DT, 0.0, DT)
+    moving = predicted(e, z, LEARNING, 400.0 * DT, 0.0, DT)
     assert moving[1].p_11 > still[1].p_11
     assert moving[1].p_22 > still[1].p_22
+
+
+# What the wheels tell
+
+changes = st.floats(-1.0, 1.0)
+MOST = 6.5e-4  # mm per sample and sample: 650 mm/s²
+
+
+@untimed
+@given(changes, changes, changes)
+def test_a_change_is_usual_or_slip_or_spin_and_nothing_gets_lost(change, beyond, spin):
+    usual, slip, spun = jumps(change, beyond, spin, MOST, 0.0, 0.0)
+    assert abs(usual) <= MOST
+    assert usual + slip + (spun - spin) == pytest.approx(change, abs=1e-15)
+    assert slip * change >= 0.0
+
+
+@untimed
+@given(st.floats(-MOST, MOST), changes, changes)
+def test_what_the_motors_can_do_is_no_slip(change, beyond, spin):
+    assert jumps(change, beyond, spin, MOST, 0.0, 0.0) == (change, 0.0, spin)
+
+
+@untimed
+@given(changes, changes)
+def test_without_limits_on_accelerations_nothing_is_slip(change, beyond):
+    assert jumps(change, beyond, 0.0, math.inf, 0.0, MOST) == (change, 0.0, 0.0)
+
+
+@untimed
+@given(st.floats(0.01, 1.0), st.sampled_from([1.0, -1.0]))
+def test_wheels_moved_away_from_what_was_asked_tell_slip(change, way):
+    """As far as they have come past it; what leads towards it is spin."""
+    _, slip, spin = jumps(way * change, way * change, 0.0, MOST, 0.0, 0.0)
+    assert (slip, spin) == (pytest.approx(way * (change - MOST)), 0.0)
+    _, slip, spin = jumps(way * change, -way * 0.5, 0.0, MOST, 0.0, 0.0)
+    assert (slip, spin) == (0.0, pytest.approx(way * (change - MOST)))
+    _, slip, _ = jumps(way * change, way * 0.005, 0.0, MOST, 0.0, 0.0)
+    assert slip == way * 0.005
+
+
+@untimed
+@given(st.floats(0.01, 1.0), st.floats(0.0, 1.0), st.sampled_from([1.0, -1.0]))
+def test_a_wheel_that_gets_hold_again_is_no_slip(spin, share, way):
+    """The way back of a spin that it had leaves slip where it was."""
+    back = -way * (share * spin + MOST)
+    _, slip, left = jumps(back, back, way * spin, MOST, 0.0, 0.0)
+    assert slip == pytest.approx(0.0, abs=1e-12)
+    assert left == pytest.approx(way * spin * (1.0 - share), abs=1e-12)
+
+
+@untimed
+@given(changes)
+def test_a_spin_ends_with_the_grip_and_not_beyond(spin):
+    spins = [spin]
+    for _ in range(3):
+        spins.append(jumps(0.0, 0.0, spins[-1], MOST, 0.0, 0.5)[2])
+    assert np.all(np.abs(spins[1:]) == np.maximum(np.abs(spins[:-1]) - 0.5, 0.0))
+    assert np.all(np.array(spins) * spin >= 0.0)
+
+
+@untimed
+@given(changes, changes, changes)
+def test_left_and_right_are_alike(change, beyond, spin):
+    there = jumps(change, beyond, spin, MOST, 1e-8, 2e-4)
+    back = jumps(-change, -beyond, -spin, MOST, 1e-8, 2e-4)
+    assert tuple(-one for one in back) == there
+
+
+NO_WHEELS = {"most_acceleration_mm_s2": None, "most_yaw_acceleration_rad_s2": None}
+
+
+class Steps:
+    """The leader on ∞ under `slip`, by itself: how far the estimated slip was off after each step."""
+
+    def __init__(self, encoder: dict[str, float], **fields: float | None) -> None:
+        disturbance = {
+            "slip": {
+                "delta_1_mm_s": {"type": "uniform", "low": -60, "high": 60, "every_s": 3},
+                "delta_2_rad_s": {"type": "uniform", "low": -0.4, "high": 0.4, "every_s": 3},
+            },
+            "encoder": encoder,
+        }
+        scenario = load_scenario(
+            "infinity",
+            robots=1,
+            horizon_s=40.0,
+            estimator="ekf-slip",
+            disturbance=disturbance,
+            ekf_slip=fields,
+        )
+        formation, policy = Formation(scenario), ReferencePolicy("tuned")
+        formation.reset(3)
+        a = formation.arrays
+        rows = [PATHS.index(f"slip.{name}") for name in ("delta_1_mm_s", "delta_2_rad_s")]
+        off, new, motion = [], [], []
+        before = np.zeros(2)
+        for k in range(scenario.horizon_steps):
+            a.actions[0] = policy.predict(a.observations[0])[0]
+            formation.step()
+            now = a.applied[rows, 0, 0].copy()
+            off.append(a.slip_estimates[:2, 0, 0] - now)
+            if (now != before).any() and k > 500:
+                new.append(k)
+                motion.append(np.abs(now - before))
+            before = now
+        self.off = np.abs(np.array(off))
+        self.after = self.off[np.array(new)] / np.array(motion)  # (steps, 2)
+
+
+def test_new_slip_is_known_sooner_by_the_wheels():
+    """Where the wheel loop lets them follow the floor, they jump by it, since the body does not.
+
+    Without them hardly anything of a change is known at the end of the control period in which it came.
+    """
+    quick, slow = Steps({}), Steps({}, **NO_WHEELS)
+    assert (np.median(quick.after, axis=0) < 0.8).all()
+    assert (np.median(slow.after, axis=0) > 0.95).all()
+    assert (quick.off[500:].mean(axis=0) < 0.75 * slow.off[500:].mean(axis=0)).all()
+
+
+@pytest.mark.parametrize(
+    "encoder", [{"noise_std_rad": 0.002}, {"quantum_rad": 2 * math.pi / 4096}], ids=str
+)
+def test_rough_encoders_tell_no_false_slip(encoder):
+    """How rough they are is learned: the estimate is worse by a fifth at most, and not by multiples."""
+    quick, slow = Steps(encoder), Steps(encoder, **NO_WHEELS)
+    assert (quick.off[500:].mean(axis=0) < 1.2 * slow.off[500:].mean(axis=0)).all()
+
+
+def test_without_the_learned_roughness_rough_encoders_would_tell_false_slip():
+    """So the test above can fail."""
+    change = np.random.default_rng(9).normal(0.0, 0.14, 2000)  # mm: 2 mrad of noise in two readings
+    calm = [abs(jumps(c, c, 0.0, MOST, 0.14**2, 0.0)[1]) for c in change]
+    wild = [abs(jumps(c, c, 0.0, MOST, 0.0, 0.0)[1]) for c in change]
+    assert np.mean(calm) < 1e-3 * np.mean(wild)
 
 
 # On the plant, in the loop. The filter expects noisier fixes than the nominal ones, and slip that wanders.

@@ -189,6 +189,8 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                     read_slip_estimate(a.slip_estimates, r, lane),
                     trace,
                     draw,
+                    order,
+                    k,
                     s.estimator,
                     s.dt,
                 )

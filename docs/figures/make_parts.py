@@ -25,12 +25,14 @@ WITHOUT_LEARNING = {
     "fix_variance_mm2": 2.1,
     "fix_variance_factor": 1.0,
 }
+WITHOUT_WHEELS = {"most_acceleration_mm_s2": None, "most_yaw_acceleration_rad_s2": None}
 WITHOUT_SURPRISE = {"surprise_threshold": None}
 FILTERS: dict[str, dict[str, Any]] = {
     "whole": {},
+    "wheels tell nothing": {"ekf_slip": WITHOUT_WHEELS},
     "without surprise": {"ekf_slip": WITHOUT_SURPRISE},
     "variance of a fix fixed, 2.1 mm²": {"ekf_slip": WITHOUT_LEARNING},
-    "without either": {"ekf_slip": {**WITHOUT_LEARNING, **WITHOUT_SURPRISE}},
+    "none of the three": {"ekf_slip": {**WITHOUT_LEARNING, **WITHOUT_SURPRISE, **WITHOUT_WHEELS}},
     "the true pose and slip": {"estimator": "truth"},
 }
 LAWS: dict[str, dict[str, Any]] = {

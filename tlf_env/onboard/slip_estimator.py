@@ -4,9 +4,10 @@ The wheels tell how far they rolled; the floor may move the robot on top of that
 in yaw with δ₂. Both are taken as random walks and are seen through the position fixes. The process
 noise is a variance per second, so that the filter is the same at every sampling rate.
 
-It learns two things while it runs. How noisy the fixes are: from the differences of successive
-innovations, which hardly see what else is wrong. And whether slip has just changed: then the innovations
-no longer average out, and the walks are widened until they do.
+It learns three things while it runs. How noisy the fixes are: from the differences of successive
+innovations, which hardly see what else is wrong. Whether slip has just changed: then the innovations no
+longer average out, and the walks are widened until they do. And how, if it changed at once: a floor that
+begins to move takes the light wheels along and not the robot, and their speed jumps.
 """
 
 from __future__ import annotations
@@ -19,31 +20,43 @@ from tlf_env.numerics.trig import sincos
 from tlf_env.onboard.estimator import Estimate, certainty
 from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
+ROUGHNESS_TIME_S = 0.5  # over which the encoders' roughness is learned
+JUMP_NOISE = 4.0  # standard deviations of encoder noise below which nothing is a jump
+
 
 class SlipEkfParameters(Frozen):
     """Noise of the filter, and the bounds that its slip estimates are held within."""
 
-    forward_noise_mm2_s: NonNegative = 19.0  # of the position along the heading
+    forward_noise_mm2_s: NonNegative = 35.0  # of the position along the heading
     sideways_noise_mm2_s: NonNegative = 0.09
-    heading_noise_rad2_s: NonNegative = 2.8e-5
-    delta_1_walk_mm2_s3: NonNegative = 850.0
-    delta_2_walk_rad2_s3: NonNegative = 0.016
+    heading_noise_rad2_s: NonNegative = 9.0e-6
+    delta_1_walk_mm2_s3: NonNegative = 440.0
+    delta_2_walk_rad2_s3: NonNegative = 0.0185
     fix_variance_mm2: Positive = 0.2  # of each coordinate; where the filter begins
     fix_variance_time_s: Positive | None = 0.5  # over which it is learned; None: it stays
     least_fix_variance_mm2: Positive = 0.05
-    fix_variance_factor: Positive = 5.6  # of what was learned, for what this model leaves out
-    delta_1_bound_mm_s: NonNegative = 55.0
-    delta_2_bound_rad_s: NonNegative = 0.4
+    fix_variance_factor: Positive = 18.0  # of what was learned, for what this model leaves out
+    delta_1_bound_mm_s: NonNegative = 60.0
+    delta_2_bound_rad_s: NonNegative = 0.415
     # Surprise: innovations averaged over this time, squared, against what fixes alone explain. It sets in
     # at the threshold and grows by 1 with every threshold more; None: never. At 1 this much process noise is
     # added. It fades with the square of the speed below surprise_speed_mm_s: who stands cannot tell yaw.
     surprise_time_s: Positive = 0.05
-    surprise_threshold: Positive | None = 7.0
+    surprise_threshold: Positive | None = 6.2
     most_surprise: NonNegative = 5.0
     surprise_speed_mm_s: Positive = 300.0
     heading_surprise_rad2_s: NonNegative = 3.4e-4
-    delta_1_surprise_mm2_s3: NonNegative = 28000.0
-    delta_2_surprise_rad2_s3: NonNegative = 0.05
+    delta_1_surprise_mm2_s3: NonNegative = 8000.0
+    delta_2_surprise_rad2_s3: NonNegative = 0.18
+    # What the motors can do to a robot whose wheels roll. Wheels that change their speed faster were moved by
+    # the floor, which counts as slip, or have broken loose. None: nothing is read from them.
+    most_acceleration_mm_s2: Positive | None = 650.0
+    most_yaw_acceleration_rad_s2: Positive | None = 4.4
+    grip_mm_s2: NonNegative = 850.0  # with which a robot follows wheels that spin
+    yaw_grip_rad_s2: NonNegative = 5.0
+    jump_uncertainty: NonNegative = (
+        0.1  # standard deviation of such a jump of slip, as a share of it
+    )
 
 
 class SlipEkf(NamedTuple):
@@ -67,6 +80,12 @@ class SlipEkf(NamedTuple):
     surprise_heading: float
     surprise_1: float
     surprise_2: float
+    change_1: float  # mm per sample and sample
+    change_2: float  # rad per sample and sample
+    grip_1: float  # likewise
+    grip_2: float
+    unsure: float  # variance of slip for the square of a jump of increments, 1/s²
+    settling: float  # share of a sample in the learned roughness
 
 
 class SlipEstimate(NamedTuple):
@@ -91,6 +110,12 @@ class SlipEstimate(NamedTuple):
     d_y: float
     ahead: float  # mean innovation, forward and right, mm
     aside: float
+    u_1: float  # the wheels' last increments, mm and rad
+    u_2: float
+    spin_1: float  # what of them is spin, mm and rad
+    spin_2: float
+    rough_1: float  # mean square of their changes, by encoder noise mostly
+    rough_2: float
 
 
 read_slip_ekf = reader(SlipEkf)
@@ -127,6 +152,14 @@ def slip_ekf_constants(p: SlipEkfParameters, dt_s: float) -> SlipEkf:
         p.heading_surprise_rad2_s * dt_s,
         p.delta_1_surprise_mm2_s3 * dt_s,
         p.delta_2_surprise_rad2_s3 * dt_s,
+        math.inf if p.most_acceleration_mm_s2 is None else p.most_acceleration_mm_s2 * dt_s**2,
+        math.inf
+        if p.most_yaw_acceleration_rad_s2 is None
+        else p.most_yaw_acceleration_rad_s2 * dt_s**2,
+        p.grip_mm_s2 * dt_s**2,
+        p.yaw_grip_rad_s2 * dt_s**2,
+        (p.jump_uncertainty / dt_s) ** 2,
+        share(dt_s, ROUGHNESS_TIME_S),
     )
 
 
@@ -140,11 +173,55 @@ def surprise(mean: float, variance: float, ekf: SlipEkf) -> float:
 
 
 @law
+def held(value: float, end: float) -> float:
+    """``value`` held between 0 and ``end``."""
+    return min(max(value, min(end, 0.0)), max(end, 0.0))
+
+
+@law
+def jumps(
+    change: float, beyond: float, spin: float, most: float, rough: float, grip: float
+) -> tuple[float, float, float]:
+    """What of a change of the wheels' increment was usual, what the floor did, and their new spin.
+
+    More than motors and encoder noise can do to a robot that rolls leads either away from what was asked of
+    the wheels, which now are so far ``beyond`` it: the floor moved, or a wheel that spun got hold again. Or
+    towards it: the wheels broke loose. They then spin so much faster than the robot moves, which follows.
+    """
+    most += JUMP_NOISE * math.sqrt(rough)
+    usual = min(max(change, -most), most)
+    away = held(change - usual, beyond)
+    spun = spin + (change - usual - away)
+    regained = held(away, -spun)
+    spun += regained
+    return usual, away - regained, spun - held(spun, math.copysign(grip, spun))
+
+
+@law
 def predict_with_slip(
-    e: Estimate, z: SlipEstimate, ekf: SlipEkf, u_1: float, u_2: float, dt: float
+    e: Estimate,
+    z: SlipEstimate,
+    ekf: SlipEkf,
+    u_1: float,
+    u_2: float,
+    asked_1: float,
+    asked_2: float,
+    dt: float,
 ) -> tuple[Estimate, SlipEstimate]:
-    """Pose, slip and covariance one sample on, for increments u₁ (mm) and u₂ (rad) of the wheels."""
-    moved, turned = u_1 + z.delta_1 * dt, u_2 + z.delta_2 * dt
+    """Pose, slip and covariance one sample on.
+
+    The wheels' increments are u₁ (mm) and u₂ (rad); ``asked`` is what was asked of them, or their last
+    increments where nothing was.
+    """
+    change_1, change_2 = u_1 - z.u_1, u_2 - z.u_2
+    usual_1, jump_1, spin_1 = jumps(
+        change_1, u_1 - asked_1, z.spin_1, ekf.change_1, z.rough_1, ekf.grip_1
+    )
+    usual_2, jump_2, spin_2 = jumps(
+        change_2, u_2 - asked_2, z.spin_2, ekf.change_2, z.rough_2, ekf.grip_2
+    )
+    delta_1, delta_2 = z.delta_1 - jump_1 / dt, z.delta_2 - jump_2 / dt
+    moved, turned = u_1 - spin_1 + delta_1 * dt, u_2 - spin_2 + delta_2 * dt
     middle = e.theta + 0.5 * turned
     noise = max(ekf.variance + z.variance, ekf.least)
     speed = min(abs(u_1) / ekf.fast, 1.0)
@@ -186,22 +263,28 @@ def predict_with_slip(
             m_tt + dt * m_t2 + ekf.heading + ekf.surprise_heading * sideways,
         ),
         SlipEstimate(
-            z.delta_1,
-            z.delta_2,
+            delta_1,
+            delta_2,
             m_x1,
             m_y1,
             m_t1,
             m_x2,
             m_y2,
             m_t2,
-            z.p_11 + ekf.walk_1 + ekf.surprise_1 * forward,
+            z.p_11 + ekf.walk_1 + ekf.surprise_1 * forward + ekf.unsure * jump_1 * jump_1,
             z.p_12,
-            z.p_22 + ekf.walk_2 + ekf.surprise_2 * sideways,
+            z.p_22 + ekf.walk_2 + ekf.surprise_2 * sideways + ekf.unsure * jump_2 * jump_2,
             z.variance,
             z.d_x,
             z.d_y,
             z.ahead,
             z.aside,
+            u_1,
+            u_2,
+            spin_1,
+            spin_2,
+            z.rough_1 + ekf.settling * (usual_1 * usual_1 - z.rough_1),
+            z.rough_2 + ekf.settling * (usual_2 * usual_2 - z.rough_2),
         ),
     )
 
@@ -258,6 +341,12 @@ def correct_with_slip(
             d_y,
             z.ahead + ekf.averaging * (ahead - z.ahead),
             z.aside + ekf.averaging * (aside - z.aside),
+            z.u_1,
+            z.u_2,
+            z.spin_1,
+            z.spin_2,
+            z.rough_1,
+            z.rough_2,
         ),
         d_x,
         d_y,

@@ -72,24 +72,24 @@ CONTROLLERS: dict[str, Controller] = {
     **{name: Controller(gains=gains) for name, gains in GAIN_PRESETS.items()},
     "tuned": Controller(
         gains=TrackingGains(
-            k_1_per_s=1.6, k_2_mm2_s=6.0 * 1.75e4, k_3_mm2=1.75e4, eta=1e-4, epsilon=0.05
+            k_1_per_s=1.3, k_2_mm2_s=4.9 * 2.15e4, k_3_mm2=2.15e4, eta=1e-4, epsilon=0.05
         ),
         limits=TwistLimits(
-            braking_error_mm=7.8,
+            braking_error_mm=23.0,
             forward_error_mm=119.0,
             lateral_error_mm=150.0,
-            acceleration_mm_s2=185.0,
+            acceleration_mm_s2=195.0,
             turning_acceleration_mm_s2=150.0,
-            yaw_acceleration_rad_s2=22.0,
+            yaw_acceleration_rad_s2=11.5,
             yaw_rate_rad_s=1.5,
-            lateral_acceleration_mm_s2=173.0,
-            free_speed_mm_s=58.0,
+            lateral_acceleration_mm_s2=165.0,
+            free_speed_mm_s=130.0,
             free_reach_mm=27.0,
             reverse_mm_s=20.0,
             cancel_slip=True,
         ),
         spacing=Spacing(),
-        lead_s=0.015,
+        lead_s=0.02,
     ),
 }
 

@@ -43,6 +43,8 @@ class Trace(NamedTuple):
 
     distance: float  # odometry, mm
     turn: float  # odometry, rad
+    moved: float  # the same with the estimated slip, mm
+    turned: float  # rad
     innovation_forward: float  # sums of the EKF's innovation in estimated body axes, mm
     innovation_right: float
     nis: float  # sum of the normalised innovation squared

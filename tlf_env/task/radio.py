@@ -39,8 +39,7 @@ def broadcast(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
         u_1, u_2 = forward_and_yaw(read_motion(a.motions, r, lane))
     else:
         trace = read_trace(a.traces, r, lane)
-        u_1 = trace.distance / s.period + a.slip_estimates[DELTA_1, r, lane]
-        u_2 = trace.turn / s.period + a.slip_estimates[DELTA_2, r, lane]
+        u_1, u_2 = trace.moved / s.period, trace.turned / s.period
     message = Message(
         a.estimates[0, r, lane], a.estimates[1, r, lane], a.estimates[2, r, lane], u_1, u_2
     )

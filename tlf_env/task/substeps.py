@@ -43,6 +43,7 @@ from tlf_env.task.disturbance import Effects
 from tlf_env.task.settings import EKF, EKF_SLIP, TRUTH, Settings
 from tlf_env.task.signals import SignalRow, is_due, signal_value
 
+CERTAIN = (0.0,) * (len(SlipEstimate._fields) - 2)  # what the true slip leaves to be estimated
 EXTERNAL_TORQUE = 4  # stands for the kind of a robot whose wheel loop is an object outside
 NOMINALS = np.array([channel.nominal for channel in CHANNELS])
 LOWS = np.array([channel.low for channel in CHANNELS])
@@ -148,6 +149,8 @@ def trace_drive(
     return Trace(
         trace.distance,
         trace.turn,
+        trace.moved,
+        trace.turned,
         trace.innovation_forward,
         trace.innovation_right,
         trace.nis,
@@ -182,6 +185,17 @@ def disturbed_encoders(motion: Motion, effects: Effects, draw: Draw) -> Reading:
 
 
 @law
+def asked_increments(
+    order: Order, body: Body, slip: SlipEstimate, k: int, dt: float
+) -> tuple[float, float]:
+    """Way (mm) and turn (rad) asked of the wheels in substep ``k``; the last ones if torques were."""
+    if order.kind == TORQUE or order.kind == EXTERNAL_TORQUE:
+        return slip.u_1, slip.u_2
+    wanted_l, wanted_r = wanted(order, k)
+    return odometry(wanted_l * dt, wanted_r * dt, body.R, body.h)
+
+
+@law
 def sense_robot(
     body: Body,
     ekf: Ekf,
@@ -194,10 +208,12 @@ def sense_robot(
     slip: SlipEstimate,
     trace: Trace,
     draw: Draw,
+    order: Order,
+    k: int,
     kind: int,
     dt: float,
 ) -> tuple[Sensors, Estimate, SlipEstimate, Trace, Sample]:
-    """Position fix and estimator (of the ``kind``) after a substep of one robot."""
+    """Position fix and estimator (of the ``kind``) after substep ``k`` of one robot."""
     step_l, step_r = reading.left - sensors.encoder_l, reading.right - sensors.encoder_r
     u_1, u_2 = odometry(step_l, step_r, body.R, body.h)
     true_x, true_y = axle_midpoint(motion, body.d)
@@ -212,13 +228,13 @@ def sense_robot(
     if kind == EKF:
         estimate, d_x, d_y, nis = correct(predict(estimate, ekf, u_1, u_2), ekf, x, y)
     elif kind == EKF_SLIP:
-        estimate, slip = predict_with_slip(estimate, slip, slip_ekf, u_1, u_2, dt)
+        asked_1, asked_2 = asked_increments(order, body, slip, k, dt)
+        estimate, slip = predict_with_slip(estimate, slip, slip_ekf, u_1, u_2, asked_1, asked_2, dt)
         estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y)
     elif kind == TRUTH:
         ahead, yaw = forward_and_yaw(motion)
         rolled, spun = odometry(motion.omega_l, motion.omega_r, body.R, body.h)
-        certain = (0.0,) * 14
-        slip = SlipEstimate(ahead - rolled, yaw - spun, *certain)
+        slip = SlipEstimate(ahead - rolled, yaw - spun, *CERTAIN)
         estimate = Estimate(true_x, true_y, motion.theta, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     forward, right = body_errors(d_x, d_y, estimate.theta)
     return (
@@ -228,6 +244,8 @@ def sense_robot(
         Trace(
             trace.distance + u_1,
             trace.turn + u_2,
+            trace.moved + u_1 - slip.spin_1 + slip.delta_1 * dt,
+            trace.turned + u_2 - slip.spin_2 + slip.delta_2 * dt,
             trace.innovation_forward + forward,
             trace.innovation_right + right,
             trace.nis + nis,

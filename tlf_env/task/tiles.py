@@ -348,7 +348,7 @@ def any_positive(tile: np.ndarray, row: int) -> bool:
 
 
 @law
-def sense_tile(tile: np.ndarray, estimator: int, dt: float) -> None:
+def sense_tile(tile: np.ndarray, k: int, estimator: int, dt: float) -> None:
     """Encoders, position fixes and estimators, one tick on."""
     numbers = whole(tile)
     for i in range(WIDTH):
@@ -376,6 +376,8 @@ def sense_tile(tile: np.ndarray, estimator: int, dt: float) -> None:
             slip_of(tile, i),
             trace_of(tile, i),
             draw_of(numbers, i),
+            order_of(tile, i),
+            k,
             estimator,
             dt,
         )
@@ -448,7 +450,7 @@ def advance_in(
                         meet_patches(patches, variants, a.motions.shape[2], tile, count)
                     move(tile, count, s.dt)
             if senses:
-                sense_tile(tile, s.estimator, s.dt)
+                sense_tile(tile, k, s.estimator, s.dt)
                 for f in range(samples.shape[1]):
                     for i in range(count):
                         samples[k, f, columns[i]] = tile[SAMPLE + f, i]
