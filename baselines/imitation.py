@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -10,10 +10,18 @@ import torch
 from baselines.policies import fits
 from baselines.reference import ReferencePolicy
 from baselines.sb3 import FormationVecEnv
-from baselines.train_config import TrainConfig
+from baselines.train_config import ImitationConfig, TrainConfig
 from tlf_env.onboard.tracking import controller
 
 BATCH = 2048
+
+
+class Rows(NamedTuple):
+    """A round, one row for each robot and step."""
+
+    seen: np.ndarray  # observations
+    meant: np.ndarray  # what the teacher would have done
+    returns: np.ndarray  # discounted rewards that followed
 
 
 def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
@@ -21,6 +29,8 @@ def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
 
     The teacher drives all formations, disturbed a little so that its way back is seen too; the network
     is fitted to what the teacher would have done, and the critic to the discounted rewards that followed.
+    In further rounds the network drives, and the teacher only tells what it would have done: so the network
+    learns the way back from where its own errors lead (DAgger: Ross, Gordon, Bagnell, AISTATS 2011).
     Limits on accelerations are taken off the teacher: with them its command is the last one and a small
     step, and a network that imitates this drifts away.
 
@@ -34,41 +44,53 @@ def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
     scenario = envs.plants[0].scenario
     fits("the teacher", scenario, action="twist", observation="tracking")
     known = controller(wanted.controller)
-    free = known.limits.model_copy(
-        update={"acceleration_mm_s2": None, "yaw_acceleration_rad_s2": None}
-    )
-    teacher = ReferencePolicy(
-        known.model_copy(update={"limits": free}), scenario.control_period_s, scenario.preview_s
-    )
-    steps = -(-wanted.robot_steps // envs.num_envs)
+    free = {"acceleration_mm_s2": None, "yaw_acceleration_rad_s2": None}
+    known = known.model_copy(update={"limits": known.limits.model_copy(update=free)})
+    teacher = ReferencePolicy(known, scenario.control_period_s, scenario.preview_s)
+    generator = np.random.default_rng(model.seed)
+    rows: list[Rows] = []
+    for round_ in range(wanted.rounds):
+        driver = teacher if round_ == 0 else model
+        rows.append(_drive(model, envs, driver, teacher, wanted, generator))
+        seen, meant, returns = (
+            torch.from_numpy(np.concatenate(one)) for one in zip(*rows, strict=True)
+        )
+        _fit(model, seen, meant, returns, wanted.epochs, wanted.learning_rate)
+
+
+def _drive(
+    model: Any,
+    envs: FormationVecEnv,
+    driver: Any,
+    teacher: ReferencePolicy,
+    wanted: ImitationConfig,
+    generator: np.random.Generator,
+) -> Rows:
+    """What was seen while ``driver`` drove, what the teacher would have done, and what came of it."""
+    steps = -(-wanted.robot_steps // (envs.num_envs * wanted.rounds))
     shape = (steps, envs.num_envs)
     seen = np.empty((*shape, *model.observation_space.shape), dtype=np.float32)
     meant = np.empty((*shape, *model.action_space.shape), dtype=np.float32)
     rewards, dones = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.bool_)
-    generator = np.random.default_rng(model.seed)
     observations = envs.observations()
     for k in range(steps):
         seen[k] = observations
         meant[k], _ = teacher.predict(observations)
-        given = meant[k] + wanted.noise * generator.standard_normal(meant[k].shape)
+        given = meant[k]
+        if driver is not teacher:
+            given, _ = driver.predict(observations, deterministic=True)
+        given = given + wanted.noise * generator.standard_normal(given.shape)
         observations, rewards[k], dones[k], _ = envs.step(np.clip(given, -1.0, 1.0))
+    model._last_obs = observations
+    model._last_episode_starts = np.asarray(dones[-1])
     returns = np.empty_like(rewards)
     last = rewards[-steps // 4 :].mean() / (1.0 - model.gamma)  # as if it went on like that
     following = np.full(envs.num_envs, last, dtype=np.float32)
     for k in reversed(range(steps)):
         following = rewards[k] + model.gamma * np.where(dones[k], 0.0, following)
         returns[k] = following
-    rows = steps * envs.num_envs
-    _fit(
-        model,
-        torch.from_numpy(seen.reshape(rows, -1)),
-        torch.from_numpy(meant.reshape(rows, -1)),
-        torch.from_numpy(returns.ravel()),
-        wanted.epochs,
-        wanted.learning_rate,
-    )
-    model._last_obs = observations
-    model._last_episode_starts = np.asarray(dones[-1])
+    count = steps * envs.num_envs
+    return Rows(seen.reshape(count, -1), meant.reshape(count, -1), returns.ravel())
 
 
 def _fit(

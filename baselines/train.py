@@ -109,6 +109,7 @@ def _train(
     threads: int,
     progress: Callable[[int, int], None] | None,
 ) -> dict[str, Any]:
+    started = time.perf_counter()
     envs = make_envs(config, threads)
     model = make_model(config, envs, seed)
     model.set_logger(Logger(str(folder), tensorboard(folder)))
@@ -120,7 +121,7 @@ def _train(
         if config.imitation is not None:
             imitate(model, envs, config)
         judge(model, config, seed, folder, done, command)
-    began = time.perf_counter() - done.wall_time_s
+    began = started - done.wall_time_s
     with interrupts() as stop:
         while model.num_timesteps < config.robot_steps:
             before = model.num_timesteps

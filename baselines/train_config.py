@@ -40,7 +40,8 @@ class ImitationConfig(Frozen):
     """Doing first what the reference does; PPO with twists from ``tracking`` only."""
 
     controller: str = "tuned"  # gains of the reference, without its limits on accelerations
-    robot_steps: Count = 600_000  # that it drives to be imitated
+    robot_steps: Count = 600_000  # in all rounds
+    rounds: Count = 1  # in the first the reference drives, in the others the network
     noise: NonNegative = 0.02  # on its actions, standard deviation
     epochs: Count = 10
     learning_rate: Positive = 1e-3

@@ -211,6 +211,44 @@ class TestTraining:
         assert apart < 0.5 * np.abs(meant).mean()  # what an action of 0 is apart, halved
         assert np.array_equal(model._last_obs, seen)
 
+    def test_after_the_first_round_of_an_imitation_the_network_drives(self, monkeypatch):
+        """And the teacher still says what it should have done; no round gets lost."""
+        from baselines import imitation
+        from baselines.train import make_envs, make_model
+
+        fields = {**SHORT, "horizon_s": 10.0, "action": "twist", "estimator": "ekf-slip"}
+        config = load_config(
+            {
+                **CONFIG,
+                "scenario": fields,
+                "imitation": {"robot_steps": 600, "rounds": 3, "epochs": 1, "noise": 0.0},
+            }
+        )
+        envs = make_envs(config, 1)
+        model = make_model(config, envs, 0)
+        envs.seed(0)
+        envs.reset()
+        drivers, fitted = [], []
+        drive, fit = imitation._drive, imitation._fit
+
+        def watched(model_, envs_, driver, teacher, *rest):
+            drivers.append("teacher" if driver is teacher else "network")
+            rows = drive(model_, envs_, driver, teacher, *rest)
+            taught = teacher.predict(rows.seen)[0]
+            assert abs(taught - rows.meant).max() < 1e-6
+            return rows
+
+        def counted(model_, seen, *rest):
+            fitted.append(len(seen))
+            fit(model_, seen, *rest)
+
+        monkeypatch.setattr(imitation, "_drive", watched)
+        monkeypatch.setattr(imitation, "_fit", counted)
+        imitation.imitate(model, envs, config)
+        assert drivers == ["teacher", "network", "network"]
+        assert fitted == [fitted[0], 2 * fitted[0], 3 * fitted[0]]
+        assert 600 <= fitted[-1] < 600 + 3 * envs.num_envs
+
     def test_another_training_in_the_folder_is_refused(self, tmp_path):
         from baselines.train import train
 
