@@ -72,7 +72,7 @@ CONTROLLERS: dict[str, Controller] = {
     **{name: Controller(gains=gains) for name, gains in GAIN_PRESETS.items()},
     "tuned": Controller(
         gains=TrackingGains(
-            k_1_per_s=1.3, k_2_mm2_s=4.9 * 2.15e4, k_3_mm2=2.15e4, eta=1e-4, epsilon=0.05
+            k_1_per_s=1.3, k_2_mm2_s=105_350.0, k_3_mm2=2.15e4, eta=1e-4, epsilon=0.05
         ),
         limits=TwistLimits(
             braking_error_mm=23.0,
