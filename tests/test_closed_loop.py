@@ -233,16 +233,16 @@ def test_scattered_starts_lose_the_filter_and_not_the_law():
 
 # Under disturbances, ∞ for 60 s: the tuned controller on its estimate of the slip, and the paper's
 
-# RMS position error of the worst robot in the last 30 %, mm: the largest of seeds 0 to 2. The test
-# allows 1.5 times as much.
+# RMS position error of the worst robot in the last 30 %, mm: the smallest figure that `tuned` has had here,
+# the largest of seeds 0 to 2. The test allows 1.5 times as much.
 TUNED_RMS_MM = {
-    "nominal": 0.8,
+    "nominal": 0.7,
     "slip": 2.5,
     "noise": 0.9,
-    "ice": 0.6,
-    "start": 0.8,
+    "ice": 0.4,
+    "start": 0.7,
     "combined-hard": 2.5,
-    "radio": 2.7,
+    "radio": 2.0,
     "actuator": 0.9,
 }
 
