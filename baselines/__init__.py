@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from baselines.learned import load_policy
-from baselines.reference import ReferencePolicy
+from baselines.policies.learned import load_policy
+from baselines.policies.reference import ReferencePolicy
 
 __all__ = ["ReferencePolicy", "load_policy"]

@@ -11,9 +11,9 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from tlf_env.engine.batch import BatchPlant
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.arrays import END_REASONS
-from tlf_env.task.batch import BatchPlant
+from tlf_env.task.info import END_REASONS
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario
 
@@ -39,7 +39,7 @@ class FormationVecEnv(VecEnv):
     Parameters
     ----------
     scenario
-        What :class:`~tlf_env.task.batch.BatchPlant` takes; several tasks as a mapping
+        What :class:`~tlf_env.engine.batch.BatchPlant` takes; several tasks as a mapping
         ``{name: one scenario, or a sequence of them}``, among which the formations are shared out.
     formations
         How many in all.

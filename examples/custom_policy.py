@@ -1,7 +1,7 @@
 """A policy of one's own: pure pursuit of the previewed reference, with the ``predict`` of SB3.
 
 Shows how to read a ``tracking`` observation by name, and that anything with this ``predict`` drives a
-formation: in a loop of one's own, in :func:`baselines.run.run_policy`, and as ``others=`` of the
+formation: in a loop of one's own, in :func:`baselines.runs.run.run_policy`, and as ``others=`` of the
 Gymnasium environment.
 
     python examples/custom_policy.py --horizon-s 100
@@ -15,7 +15,7 @@ import numpy as np
 import typer
 
 from baselines import ReferencePolicy
-from baselines.run import run_policy
+from baselines.runs.run import run_policy
 from tlf_env import load_scenario
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries

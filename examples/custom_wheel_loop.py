@@ -13,7 +13,7 @@ import numpy as np
 import typer
 
 from baselines import ReferencePolicy
-from baselines.run import run_policy
+from baselines.runs.run import run_policy
 from tlf_env import load_scenario
 from tlf_env.physics.parameters import RobotParameters
 

@@ -20,8 +20,8 @@ import torch
 import typer
 from stable_baselines3 import PPO
 
-from baselines.export import export_policy
 from baselines.sb3 import FormationVecEnv
+from baselines.training.export import export_policy
 from tlf_env import load_scenario
 
 JUDGED_FROM_SEED = 10_000  # other draws than those of the training

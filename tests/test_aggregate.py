@@ -13,8 +13,8 @@ from hypothesis import strategies as st
 
 pytest.importorskip("arch")
 
-from baselines import aggregate
-from baselines.bench import Plan
+from baselines.benchmark import aggregate
+from baselines.benchmark.bench import Plan
 
 ROBOT = {
     "lost": False,

@@ -5,15 +5,16 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stack_policy import StackPolicy
 
 import tlf_env
 from baselines import ReferencePolicy
-from baselines.run import run_policy, run_seeds
-from baselines.stack import StackPolicy
+from baselines.runs.run import run_policy, run_seeds
 from tlf_env import BatchPlant
-from tlf_env.task.arrays import END_REASONS
-from tlf_env.task.formation import Formation
-from tlf_env.task.scenario import load_scenario, preset_names, presets_folder
+from tlf_env.common.presets import preset_names, presets_folder
+from tlf_env.engine.formation import Formation
+from tlf_env.task.info import END_REASONS
+from tlf_env.task.scenario import load_scenario
 
 DISTURBANCES = preset_names(presets_folder() / "disturbances")
 POLICY = ReferencePolicy()
@@ -393,7 +394,7 @@ def test_a_policy_with_a_memory_runs_side_by_side():
 
 def test_the_benchs_lines_are_those_of_pymunk_up_to_contacts(tmp_path):
     pytest.importorskip("arch")
-    from baselines.bench import RUNS, Plan, run_bench
+    from baselines.benchmark.bench import RUNS, Plan, run_bench
 
     def plan(plant: str) -> Plan:
         return Plan(

@@ -14,11 +14,11 @@ import pytest
 
 pytest.importorskip("arch")
 
-from baselines import bench
-from baselines.aggregate import leaderboard, write_leaderboard
-from baselines.bench import Cell, Plan, parse_seeds, parse_sweep, run_bench, with_value
-from baselines.run import run_policy
-from tlf_env.cli import main
+from baselines.benchmark import bench
+from baselines.benchmark.aggregate import leaderboard, write_leaderboard
+from baselines.benchmark.bench import Cell, Plan, parse_seeds, parse_sweep, run_bench, with_value
+from baselines.cli import main
+from baselines.runs.run import run_policy
 from tlf_env.task.observation import sensor_entries
 from tlf_env.task.scenario import load_scenario
 
@@ -30,7 +30,7 @@ PLAN = Plan(
     seeds=(20_000, 20_003),
     overrides=SHORT,
 )
-COMMAND = [sys.executable, "-c", "from tlf_env.cli import main; main()", "bench"]
+COMMAND = [sys.executable, "-c", "from baselines.cli import main; main()", "bench"]
 ARGUMENTS = [
     *("--policies", "reference:consistent,pure_pursuit"),
     *("--tasks", "infinity"),
@@ -370,7 +370,7 @@ def test_an_error_in_a_worker_is_not_swallowed(tmp_path, monkeypatch):
 
 def test_the_figures_are_drawn_from_what_the_table_holds(tmp_path):
     pytest.importorskip("matplotlib")
-    from baselines.bench_figures import knob_label, write_bench_figures
+    from baselines.benchmark.figures import knob_label, write_bench_figures
 
     board = write_leaderboard(run_bench(PLAN, tmp_path), tmp_path, "tlf bench")
     written = write_bench_figures(board, tmp_path)

@@ -10,8 +10,8 @@ import pytest
 from helpers import TAIL_FROM, Run, drive
 
 from baselines import ReferencePolicy
-from baselines.policies import enter
-from baselines.run import run_policy
+from baselines.policies.registry import enter
+from baselines.runs.run import run_policy
 from tlf_env.onboard.tracking import TrackingGains
 from tlf_env.physics.parameters import RobotParameters
 from tlf_env.task.scenario import load_scenario

@@ -9,11 +9,11 @@ import pytest
 from physics_helpers import DT_S, NO_MEMORY, ROBOT, STILL, kinetic_energy, rolling
 
 import tlf_env
+from tlf_env.engine.formation import reference_table
 from tlf_env.physics.openloop import advance_open_loop
 from tlf_env.physics.parameters import RobotParameters, body_array
 from tlf_env.physics.pymunk_plant import COLLISION_SLOP_MM, ITERATIONS, PymunkPlant
 from tlf_env.physics.state import Motion
-from tlf_env.task.formation import reference_table
 
 OUTLINES_MM = 2 * ROBOT.outline_radius_mm
 AHEAD_MM = (

@@ -10,23 +10,20 @@ import pytest
 import yaml
 
 from baselines import ReferencePolicy
+from tlf_env.common.presets import preset_names, presets_folder
+from tlf_env.disturbances.channels import CHANNELS, NOMINAL_NOISE_MM, PATHS, STEP_CHANNELS, number
+from tlf_env.disturbances.model import Disturbance
+from tlf_env.engine.formation import Formation
+from tlf_env.engine.layout import Sample
+from tlf_env.engine.radio import delayed_message
+from tlf_env.engine.settings import settings
 from tlf_env.envs.parallel import parallel_env
 from tlf_env.onboard.parts import part_name
 from tlf_env.physics.parameters import RobotParameters, body, laden
 from tlf_env.physics.state import Motion
-from tlf_env.task.arrays import Info, Sample
-from tlf_env.task.channels import CHANNELS, NOMINAL_NOISE_MM, PATHS, STEP_CHANNELS, number
-from tlf_env.task.disturbance import Disturbance
-from tlf_env.task.formation import Formation
+from tlf_env.task.info import Info
 from tlf_env.task.observation import SENSOR_TAIL_ENTRIES
-from tlf_env.task.radio import delayed_message
-from tlf_env.task.scenario import (
-    START_MARGIN_MM,
-    load_scenario,
-    preset_names,
-    presets_folder,
-)
-from tlf_env.task.settings import settings
+from tlf_env.task.scenario import START_MARGIN_MM, load_scenario
 
 ROBOT = RobotParameters()
 FREE = {"joint_friction": False}  # wheels that turn without friction: the physics is closed form

@@ -16,8 +16,9 @@ from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
-from baselines import ReferencePolicy, figures
-from baselines.run import Record, run_policy
+from baselines import ReferencePolicy
+from baselines.runs import figures
+from baselines.runs.run import Record, run_policy
 from tlf_env import load_scenario
 
 ALL = {"overview", "paths", "errors", "functionals", "wheels", "slip", "time_gap"}
@@ -370,5 +371,5 @@ def test_very_many_robots_get_a_spread_of_rows() -> None:
 
 
 def test_pyplot_is_left_alone() -> None:
-    code = "import sys, baselines.figures; sys.exit('matplotlib.pyplot' in sys.modules)"
+    code = "import sys, baselines.runs.figures; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

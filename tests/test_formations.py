@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stack_policy import StackPolicy
 
 import tlf_env
 from baselines import ReferencePolicy
-from baselines.stack import StackPolicy
 from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.task.scenario import Scenario
 

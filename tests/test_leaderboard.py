@@ -10,8 +10,8 @@ import pytest
 pytest.importorskip("arch")
 pytest.importorskip("matplotlib")
 
-from baselines.aggregate import markdown
-from baselines.bench import Cell, run_cell
+from baselines.benchmark.aggregate import markdown
+from baselines.benchmark.bench import Cell, run_cell
 
 ROOT = Path(__file__).parent.parent / "docs" / "leaderboard"
 sys.path.insert(0, str(ROOT.parent / "figures"))

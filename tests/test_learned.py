@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 from safetensors.numpy import load_file, save
 
-from baselines import learned, load_policy
-from baselines.bench import policy_hash
-from baselines.card import Network, read_policy, write_policy
-from baselines.policies import enter, make_policy
-from baselines.run import run_policy
-from tlf_env.cli import main
+from baselines import load_policy
+from baselines.benchmark.bench import policy_hash
+from baselines.cli import main
+from baselines.policies import learned
+from baselines.policies.card import Network, read_policy, write_policy
+from baselines.policies.registry import enter, make_policy
+from baselines.runs.run import run_policy
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import load_scenario
 
@@ -558,7 +559,7 @@ def model_of(kind, learner, **options):
 
 @pytest.mark.parametrize("kind", ["PPO", "SAC", "RecurrentPPO"])
 def test_an_exported_model_acts_as_before(kind, learner, tmp_path):
-    from baselines.export import export_policy
+    from baselines.training.export import export_policy
 
     net = {"net_arch": [64, 64]} if kind != "SAC" else {"net_arch": [256, 256]}
     model = model_of(kind, learner, policy_kwargs=net)
@@ -587,7 +588,7 @@ def test_an_exported_model_acts_as_before(kind, learner, tmp_path):
 def test_the_normalisation_goes_along(learner, tmp_path):
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
-    from baselines.export import export_policy
+    from baselines.training.export import export_policy
 
     envs = VecNormalize(DummyVecEnv([lambda: learner]), clip_obs=3.0)
     model = model_of("PPO", envs)
@@ -602,7 +603,7 @@ def test_the_normalisation_goes_along(learner, tmp_path):
 def test_a_model_that_cannot_be_exported_is_told(learner, tmp_path):
     import torch
 
-    from baselines.export import export_policy
+    from baselines.training.export import export_policy
 
     for options, said in [
         ({"use_sde": True}, "gSDE"),

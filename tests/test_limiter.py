@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 
 import tlf_env
 from baselines import ReferencePolicy
+from tlf_env.engine.formation import Formation
 from tlf_env.envs.single import FormationEnv
 from tlf_env.onboard.estimator import odometry
 from tlf_env.onboard.limiter import (
@@ -34,7 +35,6 @@ from tlf_env.onboard.tracking import (
 )
 from tlf_env.physics.parameters import body
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
-from tlf_env.task.formation import Formation
 from tlf_env.task.observation import TRACKING_ENTRIES, Preview, Tracking, tracking_entries
 from tlf_env.task.scenario import load_scenario
 

@@ -9,14 +9,7 @@ import pytest
 from physics_helpers import forward_speed, rolling, run
 from scipy.linalg import expm
 
-from tlf_env.physics.linear import (
-    ENDLESS_GRIP,
-    INPUTS,
-    OUTPUTS,
-    STATES,
-    LinearPlant,
-    linearise,
-)
+from tlf_env.physics.linear import ENDLESS_GRIP, INPUTS, OUTPUTS, STATES, LinearPlant, linearise
 from tlf_env.physics.parameters import RobotParameters
 
 ROBOT = RobotParameters()

@@ -10,7 +10,7 @@ import pytest
 pytest.importorskip("arch")
 pytest.importorskip("matplotlib")
 
-from tlf_env.cli import main
+from baselines.cli import main
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs" / "figures"))
@@ -167,8 +167,8 @@ def test_nobody_is_best_where_all_runs_fail():
 
 
 def test_the_published_plan_can_be_run():
-    from baselines.bench import read_plan
-    from tlf_env.cli import PLAN_OPTIONS
+    from baselines.benchmark.bench import read_plan
+    from baselines.cli import PLAN_OPTIONS
 
     plan = read_plan("board", PLAN_OPTIONS)
     assert plan["seeds"].startswith("20000:")

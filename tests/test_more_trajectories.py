@@ -12,15 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from tlf_env.numerics.errors import one_line
+from tlf_env.common.errors import one_line
 from tlf_env.physics.openloop import OpenLoopInput, OpenLoopScenario, run_open_loop
 from tlf_env.physics.parameters import RobotParameters
-from tlf_env.task.feasibility import (
-    grip_acceleration,
-    motor_acceleration,
-    start_note,
-    warnings_for,
-)
+from tlf_env.task.feasibility import grip_acceleration, motor_acceleration, start_note, warnings_for
 from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.trajectories import (
     Circle,

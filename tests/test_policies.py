@@ -5,13 +5,13 @@ import sys
 
 import numpy as np
 import pytest
+from stack_policy import StackPolicy
 
-from baselines.bench import policy_hash
-from baselines.controllers import load_controller
-from baselines.policies import enter, make_policy, overrides_told, policy_names
-from baselines.run import run_policy, run_seeds
-from baselines.stack import StackPolicy
-from tlf_env.cli import main
+from baselines.benchmark.bench import policy_hash
+from baselines.cli import main
+from baselines.policies.controllers import load_controller
+from baselines.policies.registry import enter, make_policy, overrides_told, policy_names
+from baselines.runs.run import run_policy, run_seeds
 from tlf_env.envs.single import FormationEnv
 from tlf_env.onboard.tracking import controller
 from tlf_env.task.observation import sensor_entries, tracking_entries

@@ -16,11 +16,11 @@ import numpy as np
 import pytest
 
 import tlf_env
-from tlf_env.envs.drawing import FLOOR
-from tlf_env.envs.looks import NOSE, robot_colours
-from tlf_env.envs.rendering import ALARM, Renderer, round_length
-from tlf_env.envs.scene import Scene
 from tlf_env.physics.parameters import RobotParameters
+from tlf_env.rendering.drawing import FLOOR
+from tlf_env.rendering.looks import NOSE, robot_colours
+from tlf_env.rendering.renderer import ALARM, Renderer, round_length
+from tlf_env.rendering.scene import Scene
 
 pygame = pytest.importorskip("pygame")
 
@@ -242,11 +242,11 @@ def test_colours_differ() -> None:
 
 @pytest.mark.parametrize("robots", [3, 9])
 def test_a_robot_has_the_colour_that_it_has_in_the_figures(robots: int) -> None:
-    figures = pytest.importorskip("baselines.figures")
+    figures = pytest.importorskip("baselines.runs.figures")
     from matplotlib.colors import to_rgb
 
     from baselines import ReferencePolicy
-    from baselines.run import run_policy
+    from baselines.runs.run import run_policy
     from tlf_env import load_scenario
 
     run = run_policy(load_scenario("flower", robots=robots, horizon_s=0.02), ReferencePolicy())
@@ -351,7 +351,7 @@ def test_a_window_keeps_to_its_frame_rate(monkeypatch: pytest.MonkeyPatch) -> No
 @pytest.mark.parametrize("robots", [1, 3])
 def test_the_scene_of_a_formation_is_its_truth(robots: int) -> None:
     from tlf_env import parallel_env
-    from tlf_env.envs.scene import scene_of
+    from tlf_env.rendering.scene import scene_of
 
     env = parallel_env("infinity", robots=robots, control_period_s=0.05, time_gap_s=1.0)
     env.reset(seed=1)
@@ -382,7 +382,7 @@ def test_the_scene_of_a_formation_is_its_truth(robots: int) -> None:
 
 def test_a_ghost_that_stood_still_heads_as_its_robot_does() -> None:
     from tlf_env import parallel_env
-    from tlf_env.envs.scene import scene_of
+    from tlf_env.rendering.scene import scene_of
 
     env = parallel_env("infinity", control_period_s=0.05, time_gap_s=1.0, disturbance="none")
     env.reset(seed=1)

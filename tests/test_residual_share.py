@@ -10,8 +10,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from tlf_env import load_scenario
+from tlf_env.engine.formation import Formation
 from tlf_env.task.actions import residual_share
-from tlf_env.task.formation import Formation
 from tlf_env.task.observation import tracking_entries
 
 ENTRIES = tracking_entries(())

@@ -6,12 +6,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from stack_policy import StackPolicy
 
 import tlf_env
 from baselines import ReferencePolicy
-from baselines.stack import StackPolicy
 from tlf_env.envs.parallel import FormationParallelEnv
-from tlf_env.task.arrays import Info
+from tlf_env.task.info import Info
 from tlf_env.task.observation import Tracking, sensor_entries, tracking_entries
 
 X, Y, THETA = (Info._fields.index(name) for name in ("x_mm", "y_mm", "theta_rad"))

@@ -15,17 +15,11 @@ from pydantic import ValidationError
 
 import tlf_env
 from baselines import ReferencePolicy
+from tlf_env.common.presets import preset_names, presets_folder
 from tlf_env.envs.parallel import ReferenceWarning
 from tlf_env.envs.single import FormationEnv
 from tlf_env.task.observation import OBSERVATION_LIMIT, SAMPLE_ENTRIES
-from tlf_env.task.scenario import (
-    Scenario,
-    load_scenario,
-    preset_names,
-    presets_folder,
-    scenario_notes,
-    scenario_warnings,
-)
+from tlf_env.task.scenario import Scenario, load_scenario, scenario_notes, scenario_warnings
 from tlf_env.task.trajectories import sample
 
 NAN, INF = math.nan, math.inf

@@ -8,8 +8,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
-from tlf_env.numerics.errors import one_line
-from tlf_env.task.signals import Signal, SignalRow, signal_value
+from tlf_env.common.errors import one_line
+from tlf_env.disturbances.signals import Signal, SignalRow, signal_value
 
 ADAPTER: TypeAdapter[Signal] = TypeAdapter(Signal)
 DT_S = 0.001

@@ -12,6 +12,8 @@ from hypothesis import strategies as st
 from scipy import stats
 
 from baselines import ReferencePolicy
+from tlf_env.disturbances.channels import PATHS
+from tlf_env.engine.formation import Formation
 from tlf_env.onboard.estimator import Ekf, Estimate, correct, predict
 from tlf_env.onboard.slip_estimator import (
     SlipEkf,
@@ -23,8 +25,6 @@ from tlf_env.onboard.slip_estimator import (
     slip_ekf_constants,
 )
 from tlf_env.onboard.tracking import body_errors
-from tlf_env.task.channels import PATHS
-from tlf_env.task.formation import Formation
 from tlf_env.task.scenario import load_scenario
 
 DT = 0.001

@@ -11,15 +11,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from baselines import ReferencePolicy
-from tlf_env.onboard.spacing import (
-    Heard,
-    Spacing,
-    approach_speed,
-    spaced_twist,
-    spacing_row,
-)
-from tlf_env.task.batch import BatchPlant
-from tlf_env.task.formation import Formation
+from tlf_env.engine.batch import BatchPlant
+from tlf_env.engine.formation import Formation
+from tlf_env.onboard.spacing import Heard, Spacing, approach_speed, spaced_twist, spacing_row
 from tlf_env.task.observation import TRACKING_ENTRIES, Tracking
 from tlf_env.task.scenario import load_scenario
 

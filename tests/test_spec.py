@@ -6,7 +6,7 @@ from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.envs.single import FormationEnv
 from tlf_env.envs.spec import page
 from tlf_env.task.actions import ACTION_ENTRIES, ACTION_KINDS, ACTION_SIZE
-from tlf_env.task.arrays import INFO_MEANINGS, OTHER_INFO, Info
+from tlf_env.task.info import INFO_MEANINGS, OTHER_INFO, Info
 from tlf_env.task.observation import (
     PREVIEW_ENTRIES,
     SENSOR_TAIL_ENTRIES,

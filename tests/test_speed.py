@@ -5,12 +5,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from baselines import speed
+from baselines.speed import speed
 from tlf_env import BatchPlant
+from tlf_env.engine.formation import reference_table
+from tlf_env.engine.layout import make_arrays, padded
 from tlf_env.envs.vector import FormationVectorEnv
 from tlf_env.task.actions import REFERENCE
-from tlf_env.task.arrays import make_arrays, padded
-from tlf_env.task.formation import reference_table
 
 KEYS = ("env", "robots", "formations", "threads")
 

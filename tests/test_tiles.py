@@ -6,13 +6,36 @@ import numpy as np
 import pytest
 
 import tlf_env
+from tlf_env.engine import drivers
+from tlf_env.engine.excerpt import empty_excerpt
+from tlf_env.engine.formation import reference_table
+from tlf_env.engine.layout import (
+    Arrays,
+    make_arrays,
+    make_variants,
+    read_effects,
+    read_sensors,
+    read_trace,
+    write_sample,
+    write_sensors,
+    write_trace,
+)
+from tlf_env.engine.settings import Settings, settings
+from tlf_env.engine.substeps import (
+    Draw,
+    Order,
+    asked_torques,
+    disturbed_encoders,
+    evaluate,
+    floor_under,
+    sense_robot,
+    trace_drive,
+    undisturbed,
+)
+from tlf_env.engine.tiles import WIDTH, advance
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.estimator import read_ekf, read_estimate, write_estimate
-from tlf_env.onboard.slip_estimator import (
-    read_slip_ekf,
-    read_slip_estimate,
-    write_slip_estimate,
-)
+from tlf_env.onboard.slip_estimator import read_slip_ekf, read_slip_estimate, write_slip_estimate
 from tlf_env.onboard.wheel_loop import read_loop_state, read_wheel_loop, write_loop_state
 from tlf_env.physics.kernel import substep
 from tlf_env.physics.state import (
@@ -24,34 +47,7 @@ from tlf_env.physics.state import (
     write_contact,
     write_motion,
 )
-from tlf_env.task import drivers
 from tlf_env.task.actions import TWIST
-from tlf_env.task.arrays import (
-    Arrays,
-    make_arrays,
-    make_variants,
-    read_effects,
-    read_sensors,
-    read_trace,
-    write_sample,
-    write_sensors,
-    write_trace,
-)
-from tlf_env.task.excerpt import empty_excerpt
-from tlf_env.task.formation import reference_table
-from tlf_env.task.settings import Settings, settings
-from tlf_env.task.substeps import (
-    Draw,
-    Order,
-    asked_torques,
-    disturbed_encoders,
-    evaluate,
-    floor_under,
-    sense_robot,
-    trace_drive,
-    undisturbed,
-)
-from tlf_env.task.tiles import WIDTH, advance
 
 EVERYTHING: dict[str, Any] = {
     "slip": {"delta_1_mm_s": {"type": "ornstein_uhlenbeck", "std": 10, "time_constant_s": 2}},

@@ -11,9 +11,9 @@ import pytest
 import yaml
 
 from baselines import load_policy
-from baselines.train_config import load_config
-from tlf_env.cli import main
-from tlf_env.task.scenario import presets_folder
+from baselines.cli import main
+from baselines.training.config import load_config
+from tlf_env.common.presets import presets_folder
 
 SHORT = {"horizon_s": 2.0, "time_gap_s": 1.0, "preview_s": [0.5]}
 CONFIG = {
@@ -101,7 +101,7 @@ def command(tmp_path: Path, *words: str, **changes: object) -> list[str]:
 
 def test_without_its_packages_training_says_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(__import__("sys").modules, "stable_baselines3", None)
-    monkeypatch.delitem(__import__("sys").modules, "baselines.train_seeds", raising=False)
+    monkeypatch.delitem(__import__("sys").modules, "baselines.training.train_seeds", raising=False)
     monkeypatch.setattr("sys.argv", command(tmp_path))
     with pytest.raises(SystemExit) as ended:
         main()
@@ -119,7 +119,7 @@ class TestTraining:
 
     @pytest.mark.parametrize("name", ALGORITHMS)
     def test_an_interrupted_training_goes_on_to_the_same_policy(self, name, tmp_path):
-        from baselines.train import CHECKPOINT, POLICY, train
+        from baselines.training.train import CHECKPOINT, POLICY, train
 
         config = load_config({**CONFIG, **ALGORITHMS[name]})
         whole = train(config, 3, tmp_path / "whole")
@@ -146,7 +146,7 @@ class TestTraining:
         ).stat().st_size
 
     def test_a_killed_training_goes_on_from_its_last_checkpoint(self, tmp_path):
-        from baselines.train import POLICY, train
+        from baselines.training.train import POLICY, train
 
         config = load_config(CONFIG)
 
@@ -166,9 +166,9 @@ class TestTraining:
 
     def test_the_first_policy_is_the_reference_and_the_kept_one_the_best(self, tmp_path):
         from baselines import ReferencePolicy
-        from baselines.evaluate import evaluate
-        from baselines.train import train
-        from baselines.train_seeds import kept
+        from baselines.training.evaluate import evaluate
+        from baselines.training.train import train
+        from baselines.training.train_seeds import kept
 
         config = load_config({**CONFIG, "network": {"hidden": [16], "action_gain": 1e-9}})
         curve = train(config, 0, tmp_path)
@@ -189,8 +189,8 @@ class TestTraining:
         import numpy as np
 
         from baselines import ReferencePolicy
-        from baselines.imitation import imitate
-        from baselines.train import make_envs, make_model, spread_out
+        from baselines.training.imitation import imitate
+        from baselines.training.train import make_envs, make_model, spread_out
 
         fields = {**SHORT, "horizon_s": 10.0, "action": "twist", "estimator": "ekf-slip"}
         config = load_config(
@@ -213,8 +213,8 @@ class TestTraining:
 
     def test_after_the_first_round_of_an_imitation_the_network_drives(self, monkeypatch):
         """And the teacher still says what it should have done; no round gets lost."""
-        from baselines import imitation
-        from baselines.train import make_envs, make_model
+        from baselines.training import imitation
+        from baselines.training.train import make_envs, make_model
 
         fields = {**SHORT, "horizon_s": 10.0, "action": "twist", "estimator": "ekf-slip"}
         config = load_config(
@@ -250,7 +250,7 @@ class TestTraining:
         assert 600 <= fitted[-1] < 600 + 3 * envs.num_envs
 
     def test_another_training_in_the_folder_is_refused(self, tmp_path):
-        from baselines.train import train
+        from baselines.training.train import train
 
         train(load_config(CONFIG), 0, tmp_path)
         with pytest.raises(ValueError, match="holds a training of another seed"):
@@ -260,7 +260,7 @@ class TestTraining:
 
     @pytest.mark.parametrize("damage", ["cut", "text", "other"])
     def test_a_damaged_checkpoint_is_told_in_one_line(self, damage, tmp_path):
-        from baselines.train import CHECKPOINT, train
+        from baselines.training.train import CHECKPOINT, train
 
         config = load_config(CONFIG)
         train(config, 0, tmp_path)
@@ -285,7 +285,7 @@ class TestTraining:
         ],
     )
     def test_settings_that_the_algorithm_refuses(self, settings, said, tmp_path):
-        from baselines.train import train
+        from baselines.training.train import train
 
         with pytest.raises(ValueError, match=said):
             train(load_config({**CONFIG, "settings": settings}), 0, tmp_path)

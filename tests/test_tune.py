@@ -12,11 +12,12 @@ import yaml
 
 pytest.importorskip("optuna")
 
-from baselines import tune
-from baselines.controllers import load_controller
-from baselines.policies import enter
-from baselines.reference import ReferencePolicy
-from baselines.tune import (
+from baselines.cli import main
+from baselines.policies.controllers import load_controller
+from baselines.policies.reference import ReferencePolicy
+from baselines.policies.registry import enter
+from baselines.tuning import tune
+from baselines.tuning.tune import (
     CAPS,
     Job,
     Objective,
@@ -27,9 +28,9 @@ from baselines.tune import (
     load_tune,
     run_tune,
 )
-from tlf_env.cli import main
+from tlf_env.common.presets import presets_folder
 from tlf_env.onboard.tracking import CONTROLLERS, controller
-from tlf_env.task.scenario import load_scenario, presets_folder
+from tlf_env.task.scenario import load_scenario
 
 # A start of its own: the preset may change.
 GAINS = {
@@ -59,7 +60,7 @@ SMALL = {
     "startup_trials": 3,
     "objective": {"settled_formation_rmse_mm": 0},
 }
-COMMAND = [sys.executable, "-c", "from tlf_env.cli import main; main()", "tune"]
+COMMAND = [sys.executable, "-c", "from baselines.cli import main; main()", "tune"]
 
 
 def config(**fields):

@@ -14,10 +14,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from baselines.aggregate import markdown, number
-from baselines.bench import PLAN, RUNS, Cell, Plan
-from baselines.bench_figures import write_bench_figures
-from tlf_env.numerics.files import atomic
+from baselines.benchmark.aggregate import markdown, number
+from baselines.benchmark.bench import PLAN, RUNS, Cell, Plan
+from baselines.benchmark.figures import write_bench_figures
+from tlf_env.common.files import atomic
 from tlf_env.task.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]

@@ -17,7 +17,7 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Rectangle
 from matplotlib.transforms import Affine2D
 
-from tlf_env.numerics.files import atomic
+from tlf_env.common.files import atomic
 from tlf_env.onboard.wheel_loop import WheelLoopParameters, digital_wheel_loop
 from tlf_env.physics.parameters import RobotParameters
 

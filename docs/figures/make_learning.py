@@ -17,7 +17,7 @@ from make_figures import BLUE, FOLDER, GREEN, GREY, ORANGE, STYLE
 from make_speed import table
 from matplotlib.figure import Figure
 
-from tlf_env.numerics.files import atomic
+from tlf_env.common.files import atomic
 
 DOCS = FOLDER.parent
 KEPT = DOCS / "learning"

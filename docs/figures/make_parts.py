@@ -12,7 +12,7 @@ import numpy as np
 from make_board import DOCS, with_part, write_text
 
 from baselines import ReferencePolicy
-from baselines.run import run_seeds
+from baselines.runs.run import run_seeds
 from tlf_env.onboard.tracking import controller
 from tlf_env.task.scenario import load_scenario
 

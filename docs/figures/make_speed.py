@@ -13,7 +13,7 @@ import matplotlib
 from make_figures import BLUE, FOLDER, GREEN, GREY, ORANGE, STYLE
 from matplotlib.figure import Figure
 
-from tlf_env.numerics.files import atomic
+from tlf_env.common.files import atomic
 
 DOCS = FOLDER.parent
 MPE2, VMAS, ALONE, VECTOR = (

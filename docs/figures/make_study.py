@@ -13,7 +13,7 @@ from make_board import DOCS, with_part, write_text
 from scipy.stats import fisher_exact
 
 from baselines import ReferencePolicy
-from baselines.run import run_seeds
+from baselines.runs.run import run_seeds
 from tlf_env.onboard.tracking import TrackingGains
 from tlf_env.task.scenario import load_scenario
 

@@ -16,15 +16,15 @@ import pymunk
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
+from tlf_env.disturbances.channels import PATHS
+from tlf_env.disturbances.model import PatchRow, patch_rows
+from tlf_env.engine.formation import STATE_SCALES, Formation
+from tlf_env.engine.judging import terminated, truncated
 from tlf_env.envs.spec import documented
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import Factory, part_name, real_numbers
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.arrays import END_REASONS, Info, State
-from tlf_env.task.channels import PATHS
-from tlf_env.task.disturbance import PatchRow, patch_rows
-from tlf_env.task.formation import STATE_SCALES, Formation
-from tlf_env.task.judging import terminated, truncated
+from tlf_env.task.info import END_REASONS, Info, State
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
@@ -295,7 +295,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return infos
 
     def state(self) -> np.ndarray:
-        """The truth for critics, float32: :class:`tlf_env.task.arrays.State` of every robot, scaled."""
+        """The truth for critics, float32: :class:`tlf_env.engine.layout.State` of every robot, scaled."""
         return (self._formation.state() / STATE_SCALES).astype(np.float32).ravel()
 
     def render(self) -> np.ndarray | None:
@@ -313,8 +313,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return None if self.render_mode == "human" else self._draw(self.render_mode)
 
     def _draw(self, mode: str) -> np.ndarray | None:
-        from tlf_env.envs.rendering import Renderer
-        from tlf_env.envs.scene import scene_of
+        from tlf_env.rendering.renderer import Renderer
+        from tlf_env.rendering.scene import scene_of
 
         if self._renderer is None:
             self._renderer = Renderer(

@@ -10,8 +10,8 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from tlf_env.task.actions import ACTION_ENTRIES
-from tlf_env.task.arrays import INFO_MEANINGS, OTHER_INFO
 from tlf_env.task.feasibility import FARTHEST_FIX_MM, FARTHEST_START_MM, LONGEST_S
+from tlf_env.task.info import INFO_MEANINGS, OTHER_INFO
 from tlf_env.task.observation import (
     OBSERVATION_LIMIT,
     PREVIEW_ENTRIES,

@@ -11,15 +11,15 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from tlf_env.disturbances.channels import PATHS
+from tlf_env.engine import judging
+from tlf_env.engine.batch import BatchPlant
+from tlf_env.engine.excerpt import APPLIED, END, LOST, REWARD, TERMS, TOUCHED, Excerpt
 from tlf_env.envs.parallel import start_options
 from tlf_env.envs.single import BY_REFERENCE
 from tlf_env.onboard.parts import real_numbers
-from tlf_env.task import judging
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE
-from tlf_env.task.arrays import END_REASONS, Info
-from tlf_env.task.batch import BatchPlant
-from tlf_env.task.channels import PATHS
-from tlf_env.task.excerpt import APPLIED, END, LOST, REWARD, TERMS, TOUCHED, Excerpt
+from tlf_env.task.info import END_REASONS, Info
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario
@@ -55,7 +55,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Parameters
     ----------
     scenario
-        As :class:`~tlf_env.task.batch.BatchPlant` takes it: one, or a sequence that the formations share.
+        As :class:`~tlf_env.engine.batch.BatchPlant` takes it: one, or a sequence that the formations share.
     num_envs
         How many formations.
     learner

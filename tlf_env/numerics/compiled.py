@@ -29,7 +29,7 @@ from numba.extending import intrinsic
 F = TypeVar("F", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).resolve().parent.parent
-ROOMS_WITH_LAWS = ("numerics", "physics", "onboard", "task")
+ROOMS_WITH_LAWS = ("numerics", "physics", "onboard", "disturbances", "task", "engine")
 
 
 @functools.cache

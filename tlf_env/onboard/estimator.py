@@ -8,9 +8,9 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.numerics.compiled import law, reader, writer
 from tlf_env.numerics.trig import sincos
-from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
 
 class EkfParameters(Frozen):

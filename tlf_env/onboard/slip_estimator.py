@@ -15,10 +15,10 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.numerics.compiled import law, reader, writer
 from tlf_env.numerics.trig import sincos
 from tlf_env.onboard.estimator import Estimate, certainty
-from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
 ROUGHNESS_TIME_S = 0.5  # over which the encoders' roughness is learned
 JUMP_NOISE = 4.0  # standard deviations of encoder noise below which nothing is a jump

@@ -10,8 +10,8 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from tlf_env.common.models import Frozen, Positive
 from tlf_env.numerics.compiled import law
-from tlf_env.physics.parameters import Frozen, Positive
 
 
 class Spacing(Frozen):

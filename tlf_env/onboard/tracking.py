@@ -5,11 +5,11 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.trig import sincos
 from tlf_env.onboard.limiter import Limits, TwistLimits, limits_row
 from tlf_env.onboard.spacing import Spacing, SpacingRow, spacing_row
-from tlf_env.physics.parameters import Frozen, NonNegative, Positive
 
 HEADING_DAMPING_PER_S = 0.83
 

@@ -10,8 +10,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
+from tlf_env.common.models import Frozen, Positive
 from tlf_env.numerics.compiled import law, reader, writer
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Frozen, Positive
+from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
 
 
 class WheelLoopParameters(Frozen):

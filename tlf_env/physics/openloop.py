@@ -12,16 +12,12 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
+from tlf_env.common.errors import one_line
+from tlf_env.common.files import atomic
+from tlf_env.common.models import Frozen
 from tlf_env.numerics.compiled import driver
-from tlf_env.numerics.errors import one_line
-from tlf_env.numerics.files import atomic
 from tlf_env.physics.kernel import substep
-from tlf_env.physics.parameters import (
-    MILLINEWTON_PER_NEWTON,
-    Frozen,
-    RobotParameters,
-    body_array,
-)
+from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, RobotParameters, body_array
 from tlf_env.physics.state import (
     Contact,
     Floor,

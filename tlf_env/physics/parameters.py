@@ -5,38 +5,16 @@ Units: mm, kg, s, rad; torques and torque limits N·mm; inertias kg·mm².
 
 from __future__ import annotations
 
-from typing import Annotated, Any, NamedTuple, Self
+from typing import Annotated, NamedTuple, Self
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat, model_validator
+from pydantic import Field, FiniteFloat, model_validator
 
+from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.numerics.compiled import law
-
-
-def no_switch(value: Any) -> Any:
-    """The value, unless it is True or False, which Python would count as 1 or 0.
-
-    Raises
-    ------
-    ValueError
-        for True and False.
-    """
-    if isinstance(value, bool):
-        raise ValueError(f"must be a number, got {value!r}")
-    return value
-
-
-Positive = Annotated[FiniteFloat, BeforeValidator(no_switch), Field(gt=0)]
-NonNegative = Annotated[FiniteFloat, BeforeValidator(no_switch), Field(ge=0)]
 
 MILLINEWTON_PER_NEWTON = 1000.0
 LOAD_SPLIT_TOLERANCE = 1e-9
-
-
-class Frozen(BaseModel):
-    """A model whose instances never change and that refuses unknown keys."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)
 
 
 class FrictionCurve(Frozen):

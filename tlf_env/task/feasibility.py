@@ -13,11 +13,7 @@ import numpy as np
 
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, RobotParameters, body
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
-from tlf_env.task.observation import (
-    OBSERVATION_LIMIT,
-    SAMPLE_ENTRIES,
-    SENSOR_TAIL_ENTRIES,
-)
+from tlf_env.task.observation import OBSERVATION_LIMIT, SAMPLE_ENTRIES, SENSOR_TAIL_ENTRIES
 from tlf_env.task.trajectories import Trajectory, sample
 
 SAMPLE_S = 0.01

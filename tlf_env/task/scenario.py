@@ -9,7 +9,6 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Self
 
-import yaml
 from pydantic import (
     AfterValidator,
     Field,
@@ -20,27 +19,22 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from tlf_env.numerics.errors import one_line
+from tlf_env.common.errors import one_line
+from tlf_env.common.models import Frozen, NonNegative, Positive, no_switch
+from tlf_env.common.presets import preset_names, presets_folder, read_yaml
+from tlf_env.disturbances.model import Disturbance
 from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import PART_PATTERN
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import controller, controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
-from tlf_env.physics.parameters import (
-    Frozen,
-    NonNegative,
-    Positive,
-    RobotParameters,
-    no_switch,
-)
-from tlf_env.task.disturbance import Disturbance
+from tlf_env.physics.parameters import RobotParameters
 from tlf_env.task.feasibility import disturbed, sensor_warnings, start_note, warnings_for
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
 from tlf_env.task.trajectories import Trajectory
 from tlf_env.task.waypoints import MAX_MAGNITUDE, scenario_of_waypoints
 
-PACKAGE = Path(__file__).resolve().parent.parent
 MAX_ROBOTS = 1000
 BUILT_IN_ESTIMATORS = ("ekf", "ekf-slip", "truth")
 DEFAULT_CONTROL_PERIOD_S = 0.02
@@ -77,60 +71,6 @@ class FrozenDict(dict[str, float]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FrozenDict, (dict(self),)
-
-
-def presets_folder() -> Path:
-    """Where the presets lie: inside the installed package, or at the top of a source checkout."""
-    installed = PACKAGE / "configs"
-    return installed if installed.is_dir() else PACKAGE.parent / "configs"
-
-
-def preset_names(folder: Path | None = None) -> list[str]:
-    """Names of the presets in a folder of configs, by default the scenarios."""
-    return sorted(path.stem for path in (folder or presets_folder()).glob("*.yaml"))
-
-
-class _RepeatedKeyError(ValueError):
-    """A YAML mapping has a key twice."""
-
-
-class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, which would keep the last of two equal keys in silence, but for that."""
-
-    def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """The mapping as written: what it merges with ``<<`` it may override."""
-        node = super().compose_mapping_node(anchor)
-        seen = set()
-        for key, _ in node.value:
-            if isinstance(key, yaml.ScalarNode) and key.value != "<<":
-                if key.value in seen:
-                    line = key.start_mark.line + 1
-                    raise _RepeatedKeyError(
-                        f"line {line}: the key {key.value!r} stands there twice"
-                    )
-                seen.add(key.value)
-        return node
-
-
-def read_yaml(path: Path) -> dict[str, Any]:
-    """A YAML file as a mapping.
-
-    Raises
-    ------
-    ValueError
-        in one line, if the file is missing, is not YAML, is not a mapping, or has a key twice.
-    """
-    try:
-        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from error
-    except _RepeatedKeyError as error:
-        raise ValueError(f"{path}, {error}") from error
-    except (yaml.YAMLError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(data, dict):
-        raise ValueError(f"{path} must hold a mapping, got {type(data).__name__}")
-    return data
 
 
 def _disturbance_preset(name: str) -> dict[str, Any]:

@@ -14,14 +14,8 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, FiniteFloat, ValidationInfo, field_validator, model_validator
 
-from tlf_env.physics.parameters import Frozen, NonNegative, Positive
-from tlf_env.task.waypoints import (
-    MAX_MAGNITUDE,
-    Point,
-    checked_points,
-    drive_through,
-    read_points,
-)
+from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.task.waypoints import MAX_MAGNITUDE, Point, checked_points, drive_through, read_points
 
 REFERENCE_COLUMNS = ("x_mm", "y_mm", "theta_rad", "u_1_mm_s", "u_2_rad_s")
 

@@ -1,0 +1,1 @@
+"""The benchmark: policies × tasks × disturbances × seeds, and its tables."""

@@ -1,0 +1,1 @@
+"""Policies: functions from an observation to an action."""

@@ -1,0 +1,279 @@
+"""Learned policies without their learning library: MLPs and LSTMs in compiled NumPy.
+
+A row of a batch gets the same bits whatever rows are beside it, so that a batch of formations and a
+single one drive the same run. A matrix product of BLAS does not promise that: it takes another path for
+another number of rows. Here every sum is taken in one order, in float64, and rounded to float32 once
+per layer; actions differ from those of SB3, float32 throughout, by less than 1e-6.
+"""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.policies.card import WEIGHTS, Loaded, read_policy
+from tlf_env.numerics.compiled import block, driver, law
+from tlf_env.task.actions import ACTION_SIZE
+from tlf_env.task.scenario import Scenario
+
+SHIPPED = Path(__file__).resolve().parent / "weights"
+LINEAR, TANH, RELU = range(3)
+ACTIVATIONS = {"tanh": TANH, "relu": RELU}
+LOG_STD_LIMITS = (-20.0, 2.0)  # SAC's
+
+LstmState = tuple[np.ndarray, np.ndarray]  # h and c, each (1, row, unit), as sb3-contrib has them
+
+
+def shipped_policies() -> list[str]:
+    """Names of the policies that come with the package."""
+    return sorted(path.stem for path in SHIPPED.glob(f"*{WEIGHTS}"))
+
+
+def load_policy(path_or_name: str | Path, *, seed: int = 0) -> LearnedPolicy:
+    """A learned policy from ``NAME.safetensors`` and its card ``NAME.json``; runs without torch.
+
+    Parameters
+    ----------
+    path_or_name
+        A path that ends in ``.safetensors``, or the name of a shipped policy.
+    seed
+        Of the draws with ``deterministic=False``.
+
+    Raises
+    ------
+    ValueError
+        in one line, for an unknown name or what :func:`baselines.policies.card.read_policy` refuses.
+    """
+    text = str(path_or_name)
+    if text.endswith(WEIGHTS):
+        return LearnedPolicy(read_policy(Path(text)), seed=seed)
+    if text in shipped_policies():
+        return LearnedPolicy(read_policy(SHIPPED / f"{text}{WEIGHTS}"), seed=seed)
+    names = ", ".join(shipped_policies()) or "there is none yet"
+    raise ValueError(f"policy {text!r} is neither a {WEIGHTS} file nor shipped ({names})")
+
+
+class LearnedPolicy:
+    """A network with the signature of SB3's ``predict``; made by :func:`load_policy`.
+
+    Attributes
+    ----------
+    card : baselines.policies.card.Card
+        What it is and how it was made.
+    files : tuple of Path
+        Its weights and its card.
+    scenario_overrides : dict
+        Fields of a scenario that it needs, for ``load_scenario`` and ``parallel_env``. A part of
+        somebody's own (``module:factory``) is left out: a card must not choose code that is run.
+    """
+
+    privileged = False
+
+    def __init__(self, loaded: Loaded, *, seed: int = 0) -> None:
+        self.card, tensors, self.files = loaded
+        network = self.card.network
+        self._squashed = network.head == "squashed_gaussian"
+        self._activation = ACTIVATIONS[network.activation]
+        self._normalisation = (
+            tuple(tensors[f"normalise.{name}"] for name in ("mean", "var", "epsilon", "clip"))
+            if network.normalised
+            else None
+        )
+        self._lstm = (
+            (
+                _transposed(tensors["lstm.weight_ih"]),
+                _transposed(tensors["lstm.weight_hh"]),
+                tensors["lstm.bias_ih"].astype(np.float64) + tensors["lstm.bias_hh"],
+            )
+            if network.lstm
+            else None
+        )
+        self._hidden = [_dense_pair(tensors, f"hidden.{i}") for i in range(len(network.hidden))]
+        self._mean = _dense_pair(tensors, "mean")
+        if self._squashed:
+            self._log_std_layer = _dense_pair(tensors, "log_std")
+        else:
+            self._log_std = tensors["log_std"]
+        self._generator = np.random.default_rng(seed)
+        card = self.card
+        asked: dict[str, Any] = {"action": card.action, "observation": card.observation}
+        asked |= {"residual_base": card.residual_base, "estimator": card.estimator}
+        if card.residual_fade_mm:
+            asked["residual_fade_mm"] = card.residual_fade_mm
+        asked["residual_reach_mm"] = card.residual_reach_mm
+        if card.observation == "tracking":
+            asked["preview_s"] = card.preview_s
+        self.scenario_overrides = {
+            field: value
+            for field, value in asked.items()
+            if value is not None and not (isinstance(value, str) and ":" in value)
+        }
+
+    def check_fit(self, name: str, scenario: Scenario) -> None:
+        """Check that a scenario is what the policy was trained for.
+
+        Raises
+        ------
+        ValueError
+            as :meth:`baselines.policies.card.Card.check_fit` does.
+        """
+        self.card.check_fit(name, scenario)
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: LstmState | None = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """Action for one observation ``(entry,)`` or a batch ``(row, entry)``.
+
+        Parameters
+        ----------
+        state
+            With an LSTM: what the last call returned, None at the start. Otherwise handed through.
+        episode_start
+            With an LSTM: rows ``(row,)`` whose state is forgotten first. None: no row.
+        deterministic
+            False draws from the policy's Gaussian. The draws come from one generator, seeded when
+            the policy was loaded: a policy loaded anew and called alike draws alike.
+
+        Returns
+        -------
+        tuple
+            Actions ``(2,)`` or ``(row, 2)``, float32 in [−1, 1], and the next state: with an LSTM h
+            and c, each ``(1, row, unit)`` float32.
+
+        Raises
+        ------
+        ValueError
+            if the observation or the state is of another shape.
+        """
+        observation = np.asarray(observation)
+        if observation.ndim not in (1, 2) or observation.shape[-1] != len(self.card.entries):
+            raise ValueError(
+                f"the observation has the shape {observation.shape}; this policy takes "
+                f"{self.card.observation} observations of {len(self.card.entries)} entries"
+            )
+        rows = self._normalised(np.atleast_2d(observation))
+        if self._lstm is not None:
+            state = self._remembered(rows, state, episode_start)
+            rows = state[0][0]
+        for layer in self._hidden:
+            rows = _through(rows, *layer, self._activation)
+        action = self._chosen(rows) if deterministic else self._drawn(rows)
+        return (action[0] if observation.ndim == 1 else action), state
+
+    def _normalised(self, rows: np.ndarray) -> np.ndarray:
+        """VecNormalize's, in float64 as it has it, then float32."""
+        if self._normalisation is not None:
+            mean, var, epsilon, clip = self._normalisation
+            rows = np.clip((rows - mean) / np.sqrt(var + epsilon), -clip, clip)
+        return np.array(rows, dtype=np.float32, order="C")
+
+    def _remembered(
+        self, rows: np.ndarray, state: LstmState | None, episode_start: np.ndarray | None
+    ) -> LstmState:
+        """The LSTM's next state; the given one stays as it is."""
+        assert self._lstm is not None
+        shape = (1, len(rows), len(self._lstm[1]))
+        if state is None:
+            state = np.zeros(shape), np.zeros(shape)
+        if any(np.shape(part) != shape for part in state) or len(state) != 2:
+            raise ValueError(
+                f"the state must be h and c of the shape {shape}, got {[np.shape(p) for p in state]}"
+            )
+        h, c = (np.array(part[0], dtype=np.float32, order="C") for part in state)
+        if episode_start is not None:
+            anew = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), len(rows))
+            h[anew] = c[anew] = 0.0
+        next_h, next_c = np.empty((2, *shape), dtype=np.float32)
+        _lstm(rows, h, c, *self._lstm, next_h[0], next_c[0])
+        return next_h, next_c
+
+    def _chosen(self, rows: np.ndarray) -> np.ndarray:
+        if self._squashed:
+            return _through(rows, *self._mean, TANH)
+        return np.clip(_through(rows, *self._mean, LINEAR), -1.0, 1.0)
+
+    def _drawn(self, rows: np.ndarray) -> np.ndarray:
+        mean = _through(rows, *self._mean, LINEAR)
+        noise = self._generator.standard_normal((len(rows), ACTION_SIZE), dtype=np.float32)
+        if not self._squashed:
+            return np.clip(mean + np.exp(self._log_std) * noise, -1.0, 1.0)
+        log_std = np.clip(_through(rows, *self._log_std_layer, LINEAR), *LOG_STD_LIMITS)
+        return np.tanh(mean + np.exp(log_std) * noise)
+
+
+def _transposed(weight: np.ndarray) -> np.ndarray:
+    """(in, out) from (out, in): the inner loop then runs over sums that do not depend on each other."""
+    return np.array(weight.T, order="C")
+
+
+def _dense_pair(tensors: dict[str, np.ndarray], name: str) -> tuple[np.ndarray, np.ndarray]:
+    return _transposed(tensors[f"{name}.weight"]), tensors[f"{name}.bias"].astype(np.float64)
+
+
+def _through(rows: np.ndarray, weight: np.ndarray, bias: np.ndarray, activation: int) -> np.ndarray:
+    """A layer's output ``(row, out)``, float32."""
+    out = np.empty((len(rows), weight.shape[1]), dtype=np.float32)
+    _dense(rows, weight, bias, activation, out)
+    return out
+
+
+@law
+def _sigmoid(x: float) -> float:
+    return 1.0 / (1.0 + math.exp(-x))
+
+
+@block
+def _add_product(row: np.ndarray, weight: np.ndarray, sums: np.ndarray) -> None:
+    """Add ``row @ weight`` to float64 sums, entry after entry."""
+    for i in range(weight.shape[0]):
+        value = np.float64(row[i])
+        for j in range(weight.shape[1]):
+            sums[j] += value * weight[i, j]
+
+
+@driver
+def _dense(
+    rows: np.ndarray, weight: np.ndarray, bias: np.ndarray, activation: int, out: np.ndarray
+) -> None:
+    sums = np.empty(weight.shape[1])
+    for r in range(rows.shape[0]):
+        sums[:] = bias
+        _add_product(rows[r], weight, sums)
+        for j in range(weight.shape[1]):
+            value = np.float32(sums[j])
+            if activation == TANH:
+                value = np.tanh(value)
+            elif activation == RELU:
+                value = np.maximum(value, np.float32(0.0))
+            out[r, j] = value
+
+
+@driver
+def _lstm(
+    rows: np.ndarray,
+    h: np.ndarray,
+    c: np.ndarray,
+    weight_ih: np.ndarray,
+    weight_hh: np.ndarray,
+    bias: np.ndarray,
+    next_h: np.ndarray,
+    next_c: np.ndarray,
+) -> None:
+    units = weight_hh.shape[0]
+    sums = np.empty(weight_hh.shape[1])
+    for r in range(rows.shape[0]):
+        sums[:] = bias
+        _add_product(rows[r], weight_ih, sums)
+        _add_product(h[r], weight_hh, sums)
+        for j in range(units):
+            entering, kept = _sigmoid(sums[j]), _sigmoid(sums[units + j])
+            cell = kept * c[r, j] + entering * math.tanh(sums[2 * units + j])
+            next_c[r, j] = cell
+            next_h[r, j] = _sigmoid(sums[3 * units + j]) * math.tanh(cell)

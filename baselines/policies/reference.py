@@ -1,0 +1,106 @@
+"""The paper's tracking controller as a policy: a pure function of the ``tracking`` observation."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from baselines.policies.controllers import SUFFIXES, load_controller
+from tlf_env.numerics.compiled import driver
+from tlf_env.onboard.tracking import (
+    Controller,
+    ControllerRow,
+    TrackingGains,
+    controller,
+    controller_row,
+)
+from tlf_env.task.actions import ACTION_SIZE, reference_action
+from tlf_env.task.observation import Tracking, tracking_entries
+from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S, DEFAULT_PREVIEW_S
+
+
+@driver
+def _actions(rows: np.ndarray, scales: np.ndarray, row: ControllerRow, out: np.ndarray) -> None:
+    for i in range(rows.shape[0]):
+        out[i, 0], out[i, 1] = reference_action(rows[i], scales, row)
+
+
+class ReferencePolicy:
+    """Eqs (16)–(21) from the observation to a ``twist`` action, with the signature of SB3's ``predict``.
+
+    Parameters
+    ----------
+    gains
+        ``"consistent"`` (k₂ = 0.83·k₃), ``"printed"`` (k₂ = 0.83 mm²/s), ``"tuned"`` (other gains,
+        and limits on the twist), the path of a controller file (``.yaml``), :class:`TrackingGains` or
+        :class:`Controller`.
+    control_period_s
+        Period at which it acts, s: limits on accelerations need it.
+    preview_s
+        The scenario's previews, s: a lead is made from the first.
+
+    Raises
+    ------
+    ValueError
+        for an unknown preset, a file that is none, and a lead without a first preview above 0.
+    """
+
+    privileged = False
+    # An estimate of the slip, if it is to be cancelled, and what a controller file asks for.
+    scenario_overrides: Mapping[str, Any] = {}
+
+    def __init__(
+        self,
+        gains: str | TrackingGains | Controller = "consistent",
+        control_period_s: float = DEFAULT_CONTROL_PERIOD_S,
+        preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S,
+    ) -> None:
+        self.files: tuple[Path, ...] = ()
+        asked: dict[str, Any] = {}
+        if isinstance(gains, str) and gains.endswith(SUFFIXES):
+            file = load_controller(gains)
+            self.controller, asked = file.controller, file.scenario_overrides
+            self.files = (Path(gains),)
+        elif isinstance(gains, str):
+            self.controller = controller(gains)
+        elif isinstance(gains, TrackingGains):
+            self.controller = Controller(gains=gains)
+        else:
+            self.controller = gains
+        self._scales = np.array([entry.scale for entry in tracking_entries(preview_s).values()])
+        self._row = controller_row(self.controller, control_period_s, preview_s)
+        self._needed = len(self._scales) if self.controller.lead_s else len(Tracking._fields)
+        if self.controller.limits.cancel_slip:
+            asked = {"estimator": "ekf-slip"} | asked
+        self.scenario_overrides = asked
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """Action for one ``tracking`` observation ``(entry,)`` or a batch ``(batch, entry)``.
+
+        Returns the action, in the observation's dtype and within [−1, 1], and ``state`` unchanged:
+        the law has no memory.
+
+        Raises
+        ------
+        ValueError
+            if the observation is not a ``tracking`` observation.
+        """
+        observation = np.asarray(observation)
+        if observation.ndim not in (1, 2) or observation.shape[-1] < self._needed:
+            raise ValueError(
+                f"the observation has the shape {observation.shape}; a tracking observation has at "
+                f"least {self._needed} entries, in one row or a batch of rows"
+            )
+        rows = np.ascontiguousarray(np.atleast_2d(observation))
+        action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
+        _actions(rows, self._scales, self._row, action)
+        return (action[0] if observation.ndim == 1 else action), state

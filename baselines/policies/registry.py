@@ -1,0 +1,214 @@
+"""Policies by name, for the command line and the benchmark."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from pydantic import BaseModel
+
+from baselines.policies.card import WEIGHTS
+from baselines.policies.classical import FeedbackLinearisation, PurePursuit
+from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
+from baselines.policies.reference import ReferencePolicy
+from tlf_env.onboard.parts import Policy, load_part, make_part
+from tlf_env.onboard.tracking import CONTROLLERS
+from tlf_env.task.actions import ACTION_SIZE
+from tlf_env.task.observation import tracking_entries
+from tlf_env.task.scenario import Scenario, load_scenario
+
+CLASSICAL = {"pure_pursuit": PurePursuit, "feedback_linearisation": FeedbackLinearisation}
+
+
+# What a policy may ask of a scenario: what it sees, what it acts on, and what runs on board. Nothing
+# that changes the task or the disturbance, which are the same for everybody.
+OVERRIDABLE = (
+    "action",
+    "observation",
+    "residual_base",
+    "residual_fade_mm",
+    "residual_reach_mm",
+    "estimator",
+    "ekf_slip",
+    "preview_s",
+)
+
+
+class Entry(NamedTuple):
+    """A policy, and the scenario as it needs it."""
+
+    policy: Policy
+    scenario: Scenario
+    overrides: dict[str, Any]  # fields that differ from the scenario given, as JSON has them
+
+
+def policy_names() -> list[str]:
+    """The names of the policies that are not learned; they need no file."""
+    return [*(f"reference:{gains}" for gains in CONTROLLERS), *CLASSICAL]
+
+
+def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy:
+    """A policy that fits a scenario.
+
+    Parameters
+    ----------
+    name
+        ``reference`` or ``reference:GAINS``, where GAINS is a preset or the path of a controller file
+        (``.yaml``), ``pure_pursuit``, ``feedback_linearisation``, the name of a shipped learned policy,
+        the path of a ``.safetensors`` with its card beside it, ``module:factory`` of an object with
+        SB3's ``predict``, or the path of an SB3 ``.zip``.
+    trust
+        Allow an SB3 ``.zip``: loading one runs code that is in it.
+
+    Raises
+    ------
+    ValueError
+        for an unknown name, a file that cannot be read, an untrusted ``.zip``, or a policy that does
+        not fit the scenario.
+    """
+    policy = _made(name, scenario, trust=trust)
+    if isinstance(policy, LearnedPolicy):
+        policy.check_fit(name, scenario)
+    return policy
+
+
+def enter(name: str, scenario: Scenario, *, trust: bool = False) -> Entry:
+    """A policy, and the scenario with what the policy asks for in ``scenario_overrides``.
+
+    That attribute maps fields of :data:`OVERRIDABLE` to values; a learned policy has it from its
+    card. A field that the scenario's file or the caller has set stands as it is set.
+
+    Parameters
+    ----------
+    name, trust
+        As for :func:`make_policy`.
+
+    Raises
+    ------
+    ValueError
+        as for :func:`make_policy`, and if a policy asks for a field that it may not, or a value that
+        there is not.
+    """
+    policy = _made(name, scenario, trust=trust)
+    asked = _asked(name, policy, scenario)
+    if asked:
+        try:
+            fitted = load_scenario(scenario, **asked)
+        except ValueError as error:
+            raise ValueError(f"policy {name!r} asks of the scenario: {error}") from error
+        differing = {
+            field: getattr(fitted, field)
+            for field in asked
+            if getattr(fitted, field) != getattr(scenario, field)
+        }
+        asked = {field: _plain(value) for field, value in differing.items()}
+        scenario = fitted if asked else scenario
+    if isinstance(policy, LearnedPolicy):
+        policy.check_fit(name, scenario)
+    return Entry(policy, scenario, asked)
+
+
+def _plain(value: Any) -> Any:
+    """A scenario's field as JSON has it."""
+    if isinstance(value, BaseModel):
+        return value.model_dump()
+    return list(value) if isinstance(value, tuple) else value
+
+
+def overrides_told(overrides: Mapping[str, Any]) -> list[str]:
+    """What a policy asks of the scenario, for people: a field and its value each."""
+    told = []
+    for field, value in overrides.items():
+        if isinstance(value, Mapping):
+            told.append(f"{field} of its own")
+        elif isinstance(value, list):
+            told.append(f"{field} {', '.join(map(str, value))}")
+        else:
+            told.append(f"{field} {value}")
+    return told
+
+
+def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
+    """What a policy asks for and nobody has set."""
+    asked = getattr(policy, "scenario_overrides", {})
+    if not isinstance(asked, Mapping) or set(asked) - set(OVERRIDABLE):
+        raise ValueError(
+            f"policy {name!r}: scenario_overrides must map fields of {', '.join(OVERRIDABLE)}; "
+            f"got {asked!r}"
+        )
+    return {field: asked[field] for field in asked if field not in scenario.model_fields_set}
+
+
+def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
+    if name.endswith(".zip"):
+        return _stable_baselines(Path(name), scenario, trust=trust)
+    if name.endswith(WEIGHTS) or name in shipped_policies():
+        return load_policy(name)
+    head, _, tail = name.partition(":")
+    if head == "reference" and name != "reference:":
+        fits(name, scenario, action="twist", observation="tracking")
+        return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
+    if head in CLASSICAL and not tail:
+        fits(name, scenario, action="twist", observation="tracking")
+        return CLASSICAL[head](scenario.preview_s)
+    if tail:
+        return make_part("policy", name, load_part(name))
+    names = ", ".join([*policy_names(), *shipped_policies()])
+    raise ValueError(
+        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, FILE.zip"
+    )
+
+
+def fits(name: str, scenario: Scenario, *, action: str, observation: str) -> None:
+    """Check that a policy's action and observation are the scenario's.
+
+    Raises
+    ------
+    ValueError
+        naming both.
+    """
+    if (scenario.action, scenario.observation) != (action, observation):
+        raise ValueError(
+            f"policy {name!r} takes {observation!r} observations and gives {action!r} actions; the "
+            f"scenario has {scenario.observation!r} and {scenario.action!r}"
+        )
+
+
+def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
+    if not trust:
+        raise ValueError(
+            f"{path}: loading an SB3 file runs code that is in it; --trust says that you want that"
+        )
+    if not path.is_file():
+        raise ValueError(f"cannot read {path}: no such file")
+    try:
+        from stable_baselines3.common.save_util import load_from_zip_file
+    except ModuleNotFoundError as error:
+        raise ValueError(
+            f"{path} needs stable-baselines3 (pip install 'tlf-env[train]')"
+        ) from error
+    import stable_baselines3
+
+    data, _, _ = load_from_zip_file(path, device="cpu")
+    algorithm = _algorithm_of(data or {}, path)
+    model = getattr(stable_baselines3, algorithm).load(path, device="cpu")
+    wanted = (len(tracking_entries(scenario.preview_s)),)
+    seen, given = model.observation_space.shape, model.action_space.shape
+    if scenario.observation == "tracking" and (seen != wanted or given != (ACTION_SIZE,)):
+        raise ValueError(
+            f"{path}: its observation has the shape {seen} and its action {given}; the scenario's "
+            f"are {wanted} and {(ACTION_SIZE,)}"
+        )
+    return model
+
+
+def _algorithm_of(data: dict[str, object], path: Path) -> str:
+    for key, algorithm in (
+        ("clip_range", "PPO"),
+        ("target_entropy", "SAC"),
+        ("policy_delay", "TD3"),
+    ):
+        if key in data:
+            return algorithm
+    raise ValueError(f"{path}: neither a PPO, SAC nor TD3 model of stable-baselines3")

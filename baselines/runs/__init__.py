@@ -1,0 +1,1 @@
+"""One recorded run, its figures, and what long commands share."""

@@ -1,0 +1,298 @@
+"""One run of a policy on a scenario: recorded, measured, and written to a folder."""
+
+from __future__ import annotations
+
+import json
+import platform
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tlf_env.common.files import atomic
+from tlf_env.engine.batch import BatchPlant
+from tlf_env.engine.formation import Formation
+from tlf_env.engine.layout import Arrays
+from tlf_env.numerics.philox import checked_seed
+from tlf_env.onboard.parts import Factory, Policy, predicted
+from tlf_env.physics.state import Motion
+from tlf_env.task.info import Info
+from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, string_metrics
+from tlf_env.task.scenario import Scenario
+
+REPORTED_PACKAGES = ("tlf-env", "numpy", "numba", "gymnasium", "pettingzoo", "pymunk")
+
+
+# Columns of a record, in the order of trajectory.csv; each is (time, robot).
+RECORDED = (
+    "x_mm",
+    "y_mm",
+    "theta_rad",
+    "castor_rad",
+    "reference_x_mm",
+    "reference_y_mm",
+    "reference_theta_rad",
+    "position_error_mm",
+    "formation_error_mm",
+    "heading_error_rad",
+    "time_gap_error_s",
+    "J_mm_s",
+    "J_theta_rad_s",
+    "omega_l_rad_s",
+    "omega_r_rad_s",
+    "omega_l_command_rad_s",
+    "omega_r_command_rad_s",
+    "torque_l_Nmm",
+    "torque_r_Nmm",
+    "torque_rms_Nmm",
+    "energy_mJ",
+    "saturation_fraction",
+    "slip_mm_s",
+    "slid_mm",
+    "innovation_nis",
+)
+FROM_INFO = tuple(name for name in RECORDED if name in Info._fields)
+FROM_WHEELS = (
+    "castor_rad",
+    "omega_l_rad_s",
+    "omega_r_rad_s",
+    "omega_l_command_rad_s",
+    "omega_r_command_rad_s",
+)
+INFO_PLACES = [Info._fields.index(name) for name in FROM_INFO]
+PSI, THETA, OMEGA_L, OMEGA_R = (
+    Motion._fields.index(name) for name in ("psi", "theta", "omega_l", "omega_r")
+)
+
+
+@dataclass(frozen=True)
+class Record:
+    """A finished run, one row per control step (the start included).
+
+    Torques are means over the control step that ends at the row's time, ``slip_mm_s`` is its maximum.
+    """
+
+    scenario: Scenario
+    seed: int
+    policy: str
+    t_s: np.ndarray  # (time,)
+    columns: dict[str, np.ndarray]  # each (time, robot)
+    leader: np.ndarray  # (time, 2): the leader's reference path, mm
+    lost_at_s: np.ndarray  # (robot,): when the error first passed lost_beyond_mm; infinite if never
+    touched_at_s: np.ndarray  # (robot,): when it first touched another; infinite if never
+
+    def __getitem__(self, column: str) -> np.ndarray:
+        return self.columns[column]
+
+    @property
+    def robots(self) -> int:
+        """How many robots."""
+        return len(self.lost_at_s)
+
+    @property
+    def contact(self) -> bool:
+        """Whether any two robots touched."""
+        return bool(np.isfinite(self.touched_at_s).any())
+
+    def metrics(self) -> list[RobotMetrics]:
+        """The summary of every robot."""
+        return robot_metrics(
+            self.scenario, self.t_s, self.columns, self.lost_at_s, self.touched_at_s
+        )
+
+    def string(self) -> StringMetrics:
+        """How errors grow along the string of robots."""
+        return string_metrics(self.scenario, self.columns, self.leader)
+
+
+def run_policy(
+    scenario: Scenario,
+    policy: Policy,
+    seed: int = 0,
+    *,
+    name: str = "policy",
+    parts: Mapping[str, Factory] | None = None,
+    progress: Callable[[int, int], None] | None = None,
+) -> Record:
+    """Drive a policy over the whole horizon, ends or not (``end_on=()``), and record everything.
+
+    Parameters
+    ----------
+    parts
+        Factories of the parts that the scenario names, where they are at hand as objects.
+    progress
+        Called with the steps done and the steps in all.
+
+    Raises
+    ------
+    ValueError
+        naming the policy, if its ``predict`` returns no pair of actions in their shape and a state;
+        naming part and factory, for a part that cannot be made.
+    """
+    formation = Formation(scenario.model_copy(update={"end_on": ()}), parts)
+    formation.reset(checked_seed(seed))
+    a, steps = formation.arrays, scenario.horizon_steps
+    tape = _Tape(a, steps)
+    driver = _Driver(policy, scenario, a, name)
+    for k in range(1, steps + 1):
+        a.actions[:] = driver.act()
+        formation.step()
+        tape.note(k, scenario.control_period_s)
+        if progress is not None:
+            progress(k, steps)
+    return tape.record(0, scenario, seed, name)
+
+
+def run_seeds(
+    scenario: Scenario, policy: Policy, seeds: Sequence[int], *, name: str = "policy"
+) -> Iterator[Record]:
+    """The runs of several seeds side by side, without contact between robots; as :func:`run_policy`.
+
+    The policy is asked once a step for all rows, ``(seed · robots, entry)``; one that can only take the
+    rows of one formation is asked seed by seed.
+    """
+    plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds))
+    plant.reset(list(seeds))
+    a, steps = plant.arrays, scenario.horizon_steps
+    tape = _Tape(a, steps)
+    driver = _Driver(policy, scenario, a, name)
+    try:
+        actions = driver.act()
+    except ValueError:
+        if len(seeds) == 1:
+            raise
+        for seed in seeds:
+            yield from run_seeds(scenario, policy, [seed], name=name)
+        return
+    for k in range(1, steps + 1):
+        plant.step(actions)
+        tape.note(k, scenario.control_period_s)
+        if k < steps:
+            actions = driver.act()
+    for lane, seed in enumerate(seeds):
+        yield tape.record(lane, scenario, seed, name)
+
+
+class _Driver:
+    """A policy and what it remembers of an episode."""
+
+    def __init__(self, policy: Policy, scenario: Scenario, a: Arrays, name: str) -> None:
+        self._policy, self._name = policy, name
+        self._seen = a.sensor_observations if scenario.observation == "sensor" else a.observations
+        self._shape = a.actions.shape
+        self._state: Any = None
+        self._start = np.ones(self._shape[0] * self._shape[1], dtype=np.bool_)
+
+    def act(self) -> np.ndarray:
+        """Actions for all robots of all lanes."""
+        rows = self._seen.reshape(len(self._start), -1).copy()
+        answer = self._policy.predict(rows, self._state, self._start, True)
+        shape = (len(rows), self._shape[2])
+        actions, self._state = predicted(answer, shape, f"policy {self._name!r}")
+        self._start = np.zeros_like(self._start)
+        return actions.reshape(self._shape)
+
+
+class _Tape:
+    """Everything that a record needs of a run of some lanes, row by row."""
+
+    def __init__(self, a: Arrays, steps: int) -> None:
+        lanes, n = a.rewards.shape
+        self._arrays, self._steps = a, steps
+        self._infos = np.zeros((lanes, steps + 1, n, len(FROM_INFO)))
+        self._wheels = np.zeros((lanes, steps + 1, len(FROM_WHEELS), n))
+        self._lost_at_s, self._touched_at_s = np.full((2, lanes, n), np.inf)
+        self.note(0, 0.0)
+
+    def note(self, k: int, period_s: float) -> None:
+        """Row ``k``."""
+        a = self._arrays
+        self._infos[:, k] = a.infos[:, :, INFO_PLACES]
+        self._wheels[:, k, 0] = (a.motions[PSI] - a.motions[THETA]).T
+        self._wheels[:, k, 1] = a.motions[OMEGA_L].T
+        self._wheels[:, k, 2] = a.motions[OMEGA_R].T
+        self._wheels[:, k, 3:] = a.wanted.transpose(2, 0, 1)
+        if a.lost_now.any() or a.touched_now.any():
+            self._lost_at_s[a.lost_now] = k * period_s
+            self._touched_at_s[a.touched_now] = k * period_s
+
+    def record(self, lane: int, scenario: Scenario, seed: int, policy: str) -> Record:
+        """The record of a lane."""
+        period_s = scenario.control_period_s
+        columns = {name: self._infos[lane, :, :, i] for i, name in enumerate(FROM_INFO)}
+        columns |= {name: self._wheels[lane, :, i] for i, name in enumerate(FROM_WHEELS)}
+        return Record(
+            scenario=scenario,
+            seed=seed,
+            policy=policy,
+            t_s=np.arange(self._steps + 1) * period_s,
+            columns=_with_functionals(columns, period_s),
+            leader=self._arrays.table[: self._steps + 1, :2].copy(),
+            lost_at_s=self._lost_at_s[lane],
+            touched_at_s=self._touched_at_s[lane],
+        )
+
+
+def _with_functionals(rows: dict[str, np.ndarray], period_s: float) -> dict[str, np.ndarray]:
+    """Add J and J_θ of eq. (54): running integrals of the signed errors, robot − reference."""
+    error = rows["x_mm"] - rows["reference_x_mm"] + rows["y_mm"] - rows["reference_y_mm"]
+    rows["J_mm_s"] = np.cumsum(error, axis=0) * period_s
+    rows["J_theta_rad_s"] = np.cumsum(-rows["heading_error_rad"], axis=0) * period_s
+    return rows
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages that a result depends on."""
+    found = {"python": platform.python_version()}
+    for package in REPORTED_PACKAGES:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            found[package] = "unknown"
+    return found
+
+
+def summary(record: Record) -> dict[str, Any]:
+    """What ``summary.json`` holds."""
+    return {
+        "scenario": record.scenario.model_dump(mode="json"),
+        "seed": record.seed,
+        "policy": record.policy,
+        "privileged": record.scenario.privileged,
+        "settle_s": record.scenario.settle_s,
+        "versions": versions(),
+        "string": record.string()._asdict(),
+        "robots": {f"robot_{i}": metrics._asdict() for i, metrics in enumerate(record.metrics())},
+    }
+
+
+def write_record(record: Record, folder: Path) -> list[Path]:
+    """Write ``summary.json``, ``trajectory.npz`` and ``trajectory.csv``, each atomically."""
+    paths = [folder / name for name in ("summary.json", "trajectory.npz", "trajectory.csv")]
+    with atomic(paths[0], encoding="utf-8") as file:
+        json.dump(summary(record), file, indent=2, allow_nan=False)
+        file.write("\n")
+    with atomic(paths[1], "wb") as file:
+        columns: dict[str, Any] = dict(record.columns)
+        np.savez_compressed(file, t_s=record.t_s, leader_reference_mm=record.leader, **columns)
+    table = np.stack([record[name] for name in RECORDED], axis=-1).reshape(-1, len(RECORDED))
+    times = np.repeat(record.t_s, record.robots)
+    numbers = np.tile(np.arange(record.robots), len(record.t_s))
+    with atomic(paths[2], encoding="utf-8") as file:
+        file.write(",".join(("t_s", "robot", *RECORDED)) + "\n")
+        rows = np.column_stack([times, numbers, table])
+        np.savetxt(file, rows, fmt=["%.6g", "%d", *["%.9g"] * len(RECORDED)], delimiter=",")
+    return paths
+
+
+def write_mat(record: Record, folder: Path) -> Path:
+    """Write ``trajectory.mat`` (MATLAB 5 format): the columns of the run, ``(time, robot)``."""
+    from scipy.io import savemat
+
+    path = folder / "trajectory.mat"
+    with atomic(path, "wb") as file:
+        savemat(file, {"t_s": record.t_s, "leader_reference_mm": record.leader, **record.columns})
+    return path

@@ -1,0 +1,144 @@
+"""The whole state of a training as one safetensors file, from which it goes on to the same result.
+
+Nothing is pickled: a checkpoint holds numbers and JSON, and can be read without trust.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save
+
+from baselines.sb3 import FormationVecEnv
+from tlf_env.common.files import atomic
+
+TENSOR = "tensor:"  # marks a name of a tensor in the tree of plain values
+BUFFERED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+
+
+def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, told: dict[str, Any]) -> None:
+    """Write a model of SB3, its environments and all generators, whole or not at all.
+
+    Parameters
+    ----------
+    model
+        PPO, SAC or RecurrentPPO between two calls of ``learn``.
+    told
+        Anything that JSON has; :func:`read_checkpoint` gives it back.
+    """
+    tensors: dict[str, torch.Tensor] = {"torch_generator": torch.get_rng_state()}
+    # SB3 shuffles its samples with NumPy's global generator, so that one has to be kept and put back.
+    kind, keys, place, has_gauss, gauss = np.random.get_state()  # noqa: NPY002
+    tensors["numpy_generator"] = torch.from_numpy(np.asarray(keys).copy())
+    plain = {
+        "told": told,
+        "steps": model.num_timesteps,
+        "updates": model._n_updates,
+        "numpy_generator": [kind, place, has_gauss, gauss],
+        "action_generator": model.action_space.np_random.bit_generator.state,
+        "parameters": _without_tensors(model.get_parameters(), "model", tensors),
+        "memory": _without_tensors(_memory(model), "memory", tensors),
+    }
+    for i, plant in enumerate(envs.plants):
+        for name, array in plant.arrays._asdict().items():
+            tensors[f"plant.{i}.{name}"] = torch.from_numpy(array)
+    contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
+    data = save(contiguous, metadata={"state": json.dumps(plain)})
+    with atomic(path, "wb") as file:
+        file.write(data)
+
+
+def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, Any]:
+    """Put a new model and new environments into the state of a checkpoint; returns what was told.
+
+    Raises
+    ------
+    ValueError
+        if the file is damaged, or is not of such a training.
+    """
+    try:
+        with safe_open(path, "pt") as file:
+            names = list(file.keys())  # what safetensors opens cannot be iterated itself
+            tensors = {name: file.get_tensor(name) for name in names}
+            plain = json.loads(file.metadata()["state"])
+        model.set_parameters(_with_tensors(plain["parameters"], tensors), exact_match=True)
+        _remember(model, _with_tensors(plain["memory"], tensors))
+        for i, plant in enumerate(envs.plants):
+            for name, array in plant.arrays._asdict().items():
+                array[...] = tensors[f"plant.{i}.{name}"].numpy()
+            plant._seeded[:] = True
+        kind, *rest = plain["numpy_generator"]
+        keys = tensors["numpy_generator"].numpy()
+        np.random.set_state((kind, keys, *rest))  # noqa: NPY002 - as when it was written
+        model.action_space.np_random.bit_generator.state = plain["action_generator"]
+        torch.set_rng_state(tensors["torch_generator"])
+    except (SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as error:
+        raise ValueError(
+            f"{path} cannot be gone on from: {' '.join(str(error).split())}"
+        ) from error
+    model.num_timesteps, model._n_updates = plain["steps"], plain["updates"]
+    told: dict[str, Any] = plain["told"]
+    return told
+
+
+def _memory(model: Any) -> dict[str, Any]:
+    """What a model keeps from one call of ``learn`` to the next, beside its parameters."""
+    kept: dict[str, Any] = {
+        "last_observations": torch.from_numpy(model._last_obs),
+        "starts": torch.from_numpy(np.asarray(model._last_episode_starts)),
+    }
+    for name in model._get_torch_save_params()[1]:  # SAC's temperature, no part of the parameters
+        kept[name] = getattr(model, name)
+    states = getattr(model, "_last_lstm_states", None)
+    if states is not None:
+        kept["lstm"] = [list(states.pi), list(states.vf)]
+    buffer = getattr(model, "replay_buffer", None)
+    if buffer is not None:
+        rows = buffer.buffer_size if buffer.full else buffer.pos
+        kept |= {"place": buffer.pos, "full": bool(buffer.full)}
+        kept |= {name: torch.from_numpy(getattr(buffer, name)[:rows]) for name in BUFFERED}
+    return kept
+
+
+def _remember(model: Any, kept: dict[str, Any]) -> None:
+    model._last_obs = kept["last_observations"].numpy()
+    model._last_episode_starts = kept["starts"].numpy()
+    for name in model._get_torch_save_params()[1]:
+        getattr(model, name).data.copy_(kept[name])  # in place: its optimizer holds it
+    if "lstm" in kept:
+        policy, critic = (tuple(pair) for pair in kept["lstm"])
+        model._last_lstm_states = type(model._last_lstm_states)(policy, critic)
+    if "place" in kept:
+        buffer = model.replay_buffer
+        buffer.pos, buffer.full = kept["place"], kept["full"]
+        for name in BUFFERED:
+            rows = kept[name].numpy()
+            getattr(buffer, name)[: len(rows)] = rows
+
+
+def _without_tensors(tree: Any, place: str, tensors: dict[str, torch.Tensor]) -> Any:
+    """The tree as JSON has it, its tensors put aside under the names of their places."""
+    if isinstance(tree, torch.Tensor):
+        tensors[place] = tree
+        return TENSOR + place
+    if isinstance(tree, dict):  # a list of pairs: an optimizer's keys are numbers
+        pairs = [[k, _without_tensors(v, f"{place}.{k}", tensors)] for k, v in tree.items()]
+        return {"pairs": pairs}
+    if isinstance(tree, list | tuple):
+        return [_without_tensors(v, f"{place}.{i}", tensors) for i, v in enumerate(tree)]
+    return tree
+
+
+def _with_tensors(tree: Any, tensors: dict[str, torch.Tensor]) -> Any:
+    if isinstance(tree, str) and tree.startswith(TENSOR):
+        return tensors[tree.removeprefix(TENSOR)]
+    if isinstance(tree, dict):
+        return {k: _with_tensors(v, tensors) for k, v in tree["pairs"]}
+    if isinstance(tree, list):
+        return [_with_tensors(v, tensors) for v in tree]
+    return tree

@@ -1,0 +1,171 @@
+"""What ``tlf train`` is told: one frozen, validated model, read from YAML."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
+
+from pydantic import Field, FiniteFloat, ValidationError, model_validator
+
+from tlf_env.common.errors import one_line
+from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.presets import preset_names, presets_folder, read_yaml
+from tlf_env.task.scenario import Scenario, load_scenario
+
+# Seeds of the benchmark's tables start at 20000: neither training nor choosing may see them.
+TRAINING_SEEDS = (0, 10_000)
+CHOOSING_SEEDS = (10_000, 20_000)
+
+Count = Annotated[int, Field(ge=1)]
+Seeds = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]  # first, and end (not run)
+
+
+class NetworkConfig(Frozen):
+    """The policy's network, and as large a one for the critic."""
+
+    hidden: Annotated[tuple[Count, ...], Field(max_length=4)] = (64, 64)
+    activation: Literal["tanh", "relu"] = "tanh"
+    lstm: Count | None = None  # size of the LSTM's state; RecurrentPPO only
+    initial_log_std: FiniteFloat = -1.6
+    action_gain: Positive = 0.1  # factor on the first weights of the action: begin near 0
+
+
+class ImitationConfig(Frozen):
+    """Doing first what the reference does; PPO with twists from ``tracking`` only."""
+
+    controller: str = "tuned"  # gains of the reference, without its limits on accelerations
+    robot_steps: Count = 600_000  # in all rounds
+    rounds: Count = 1  # in the first the reference drives, in the others the network
+    noise: NonNegative = 0.02  # on its actions, standard deviation
+    epochs: Count = 10
+    learning_rate: Positive = 1e-3
+
+
+class EvaluationConfig(Frozen):
+    """Judging on seeds held apart: which of the policies on the way is kept."""
+
+    every: Count  # robot steps
+    seeds: Seeds = (10_000, 10_016)
+    disturbances: Annotated[tuple[str, ...], Field(min_length=1)]
+    horizon_s: Positive = 60.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        check_seeds("evaluation seeds", self.seeds, CHOOSING_SEEDS, "choose")
+        return self
+
+
+class TrainConfig(Frozen):
+    """A training: who learns what, on which episodes, and how it is judged. Times in s."""
+
+    algorithm: Literal["PPO", "SAC", "RecurrentPPO"]
+    settings: dict[str, Any] = {}  # the algorithm's own keyword arguments, in its own names
+    final_learning_rate_share: Annotated[FiniteFloat, Field(gt=0, le=1)] = 1.0  # falls linearly
+    network: NetworkConfig = NetworkConfig()
+    imitation: ImitationConfig | None = None
+    robot_steps: Count  # control steps times robots, over all formations
+    formations: Count = 96
+    seeds: Seeds = TRAINING_SEEDS  # of the episodes
+    scenario: dict[str, Any] = {}  # fields of every task
+    tasks: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]  # and of each
+    disturbances: Annotated[
+        dict[str, NonNegative], Field(min_length=1)
+    ]  # preset: share of episodes
+    levels: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)  # drawn alike
+    checkpoint_every: Count = 1_000_000  # robot steps
+    evaluation: EvaluationConfig
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        check_seeds("seeds", self.seeds, TRAINING_SEEDS, "train")
+        if (self.network.lstm is not None) != (self.algorithm == "RecurrentPPO"):
+            raise ValueError(
+                f"network.lstm is for RecurrentPPO and needed there; got {self.network.lstm} "
+                f"with {self.algorithm}"
+            )
+        if self.imitation is not None and self.algorithm != "PPO":
+            raise ValueError(f"imitation is for PPO, not for {self.algorithm}")
+        if not any(self.disturbances.values()):
+            raise ValueError("disturbances: at least one share must be above 0")
+        for reserved in ("seed", "policy", "env", "policy_kwargs", "tensorboard_log", "use_sde"):
+            if reserved in self.settings:
+                raise ValueError(f"settings.{reserved} is set elsewhere and cannot be given")
+        self.mixture()
+        self.evaluation_scenarios()
+        return self
+
+    def mixture(self) -> tuple[dict[str, list[Scenario]], list[float]]:
+        """Scenarios of each task, a disturbance and level after the other, and their shares.
+
+        Raises
+        ------
+        ValueError
+            for a scenario that there is not or that cannot run in a batch.
+        """
+        wanted = {name: share for name, share in self.disturbances.items() if share > 0}
+        shares = [share for share in wanted.values() for _ in self.levels]
+        tasks = {
+            task: [
+                self._scenario(task, disturbance=name, disturbance_level=level, **fields)
+                for name in wanted
+                for level in self.levels
+            ]
+            for task, fields in self.tasks.items()
+        }
+        return tasks, shares
+
+    def evaluation_scenarios(self) -> dict[tuple[str, str], Scenario]:
+        """Scenario of each task and disturbance that the policy is judged on."""
+        return {
+            (task, name): self._scenario(
+                task, **{**fields, "horizon_s": self.evaluation.horizon_s, "disturbance": name}
+            )
+            for task, fields in self.tasks.items()
+            for name in self.evaluation.disturbances
+        }
+
+    def _scenario(self, task: str, **fields: Any) -> Scenario:
+        return load_scenario(task, **{**self.scenario, "plant": "batch", **fields})
+
+
+def check_seeds(what: str, seeds: Seeds, allowed: Seeds, use: str) -> None:
+    """Check a range of seeds, FIRST to before END.
+
+    Raises
+    ------
+    ValueError
+        for an empty range, or one with seeds that are kept for something else.
+    """
+    first, end = seeds
+    if not allowed[0] <= first < end <= allowed[1]:
+        raise ValueError(
+            f"{what} {first}:{end} must be a range within {allowed[0]}:{allowed[1]}: those "
+            f"{use}, and the tables' seeds begin at {CHOOSING_SEEDS[1]}"
+        )
+
+
+def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> TrainConfig:
+    """A training from a preset's name, a YAML file or a mapping; keywords override its fields.
+
+    Raises
+    ------
+    ValueError
+        in one line that names the value and what is allowed.
+    """
+    if isinstance(source, Mapping):
+        data = dict(source)
+    else:
+        folder = presets_folder() / "train"
+        names = preset_names(folder)
+        path = folder / f"{source}.yaml" if str(source) in names else Path(source)
+        if path.suffix not in (".yaml", ".yml"):
+            raise ValueError(
+                f"training {str(source)!r} is neither {', '.join(names)} nor a .yaml file"
+            )
+        data = read_yaml(path)
+    data |= {name: value for name, value in overrides.items() if value is not None}
+    try:
+        return TrainConfig.model_validate(data)
+    except ValidationError as error:
+        raise ValueError(one_line(error)) from error

@@ -1,0 +1,177 @@
+"""From a model of stable-baselines3 to a policy that runs without it. Only this needs torch."""
+
+from __future__ import annotations
+
+import tempfile
+from collections.abc import Iterable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from baselines.policies.card import WEIGHTS, Card, Network, write_policy
+from baselines.policies.learned import load_policy
+from baselines.runs.run import versions
+from tlf_env.onboard.parts import Policy
+from tlf_env.task.actions import ACTION_SIZE
+from tlf_env.task.observation import OBSERVATION_LIMIT
+from tlf_env.task.scenario import Scenario
+
+if TYPE_CHECKING:
+    from stable_baselines3.common.base_class import BaseAlgorithm
+
+TRAINERS = ("torch", "stable-baselines3", "sb3-contrib")
+ALGORITHMS = ("PPO", "SAC", "RecurrentPPO")
+AGREEMENT = 1e-5  # of an action, before and after
+CHECKED_ROWS, CHECKED_STEPS = 32, 4
+
+
+def export_policy(
+    model: BaseAlgorithm,
+    path: str | Path,
+    scenario: Scenario,
+    *,
+    training: Mapping[str, Any],
+    seeds: Mapping[str, Iterable[int]],
+    scores: Mapping[str, Any] | None = None,
+    command: str = "",
+) -> Card:
+    """Write a trained model as ``NAME.safetensors`` and ``NAME.json``, whole or not at all.
+
+    Before anything is written, the policy is read back and its actions are compared with the model's
+    on random observations: a model that this does not know in every detail is refused, not bent.
+
+    Parameters
+    ----------
+    model
+        SB3's PPO or SAC or sb3-contrib's RecurrentPPO with an ``MlpPolicy`` (``MlpLstmPolicy``, one
+        layer): tanh or ReLU, no gSDE, actions in [−1, 1]². Where it was trained in a
+        ``VecNormalize`` that normalises observations, the statistics go along.
+    path
+        Ends in ``.safetensors``.
+    scenario
+        What it was trained on.
+    training
+        Settings of the algorithm, environment steps, wall time: for the card, anything that JSON has.
+    seeds
+        What was seeded, and with what: ``{"learner": [0], "episodes": range(64)}``.
+    scores
+        What it reached, for the card.
+    command
+        The command that made it.
+
+    Raises
+    ------
+    ValueError
+        for a model of another kind, or one that does not fit the scenario.
+    """
+    path = Path(path)
+    if path.suffix != WEIGHTS:
+        raise ValueError(f"{path}: the name of a policy must end in {WEIGHTS}")
+    algorithm = type(model).__name__
+    if algorithm not in ALGORITHMS:
+        raise ValueError(f"a {algorithm} model cannot be exported; {', '.join(ALGORITHMS)} can")
+    network, tensors = _network_of(model)
+    told: dict[str, Any] = {
+        "algorithm": algorithm,
+        "training": training,
+        "seeds": {name: tuple(values) for name, values in seeds.items()},
+        "versions": versions() | _trainers(),
+        "scores": scores or {},
+        "command": command,
+    }
+    with tempfile.TemporaryDirectory() as folder:
+        trial = Path(folder) / path.name
+        write_policy(trial, network, tensors, scenario, **told)
+        _check_agreement(model, load_policy(trial))
+    return write_policy(path, network, tensors, scenario, **told)
+
+
+def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
+    """What is computed, and with what."""
+    box = model.action_space
+    if box.shape != (ACTION_SIZE,) or (box.low != -1).any() or (box.high != 1).any():
+        raise ValueError(f"the model's actions must be a Box of [−1, 1]², got {box}")
+    if getattr(model, "use_sde", False):
+        raise ValueError("a model with gSDE cannot be exported")
+    if type(model).__name__ == "SAC":
+        actor = model.policy.actor
+        hidden, mean = actor.latent_pi, actor.mu
+        tensors = _dense("log_std", actor.log_std)
+    else:
+        hidden, mean = model.policy.mlp_extractor.policy_net, model.policy.action_net
+        tensors = {"log_std": _array(model.policy.log_std)}
+    lstm = getattr(model.policy, "lstm_actor", None)
+    if lstm is not None:
+        if lstm.num_layers != 1:
+            raise ValueError(
+                f"an LSTM of {lstm.num_layers} layers cannot be exported, one of 1 can"
+            )
+        for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
+            tensors[f"lstm.{name}"] = _array(getattr(lstm, f"{name}_l0"))
+    layers, activations = list(hidden)[::2], {type(one).__name__ for one in list(hidden)[1::2]}
+    linear = all(type(layer).__name__ == "Linear" for layer in layers)
+    if not linear or len(hidden) % 2 or activations not in (set(), {"Tanh"}, {"ReLU"}):
+        raise ValueError(
+            f"hidden layers must be linear with tanh or with ReLU, got {' '.join(str(hidden).split())}"
+        )
+    for i, layer in enumerate(layers):
+        tensors |= _dense(f"hidden.{i}", layer)
+    tensors |= _dense("mean", mean)
+    normaliser = model.get_vec_normalize_env()
+    normalised = normaliser is not None and normaliser.norm_obs
+    if normalised:
+        tensors |= {
+            "normalise.mean": normaliser.obs_rms.mean,
+            "normalise.var": normaliser.obs_rms.var,
+            "normalise.epsilon": np.array(normaliser.epsilon),
+            "normalise.clip": np.array(normaliser.clip_obs),
+        }
+    network = Network(
+        hidden=tuple(layer.out_features for layer in layers),
+        activation="relu" if "ReLU" in activations else "tanh",
+        lstm=None if lstm is None else lstm.hidden_size,
+        head="squashed_gaussian" if type(model).__name__ == "SAC" else "gaussian",
+        normalised=normalised,
+    )
+    return network, tensors
+
+
+def _dense(name: str, layer: Any) -> dict[str, np.ndarray]:
+    return {f"{name}.weight": _array(layer.weight), f"{name}.bias": _array(layer.bias)}
+
+
+def _array(tensor: Any) -> np.ndarray:
+    array: np.ndarray = tensor.detach().cpu().numpy()
+    return array
+
+
+def _check_agreement(model: BaseAlgorithm, policy: Policy) -> None:
+    """Compare the actions of a few steps, rows starting anew on the way."""
+    normaliser = model.get_vec_normalize_env()
+    generator = np.random.default_rng(0)
+    shape = (CHECKED_ROWS, *model.observation_space.shape)
+    state, theirs = None, None
+    for step in range(CHECKED_STEPS):
+        seen = np.clip(generator.normal(size=shape), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
+        seen = seen.astype(np.float32)
+        start = generator.random(CHECKED_ROWS) < (1.0 if step == 0 else 0.3)
+        action, state = policy.predict(seen, state, start, True)
+        seen_by_model = seen if normaliser is None else normaliser.normalize_obs(seen)
+        wanted, theirs = model.predict(seen_by_model, theirs, start, deterministic=True)
+        apart = float(np.abs(action - wanted).max())
+        if not apart <= AGREEMENT:
+            raise ValueError(
+                f"the model cannot be exported: its actions and those of its copy are {apart:.2g} apart"
+            )
+
+
+def _trainers() -> dict[str, str]:
+    found = {}
+    for package in TRAINERS:
+        try:
+            found[package] = version(package)
+        except PackageNotFoundError:
+            continue
+    return found

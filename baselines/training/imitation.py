@@ -1,0 +1,120 @@
+"""A start for policies that act by themselves: do first what the reference does."""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+import torch
+
+from baselines.policies.reference import ReferencePolicy
+from baselines.policies.registry import fits
+from baselines.sb3 import FormationVecEnv
+from baselines.training.config import ImitationConfig, TrainConfig
+from tlf_env.onboard.tracking import controller
+
+BATCH = 2048
+
+
+class Rows(NamedTuple):
+    """A round, one row for each robot and step."""
+
+    seen: np.ndarray  # observations
+    meant: np.ndarray  # what the teacher would have done
+    returns: np.ndarray  # discounted rewards that followed
+
+
+def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
+    """Fit a model of PPO to the reference that ``config.imitation`` names, and its critic to what that earns.
+
+    The teacher drives all formations, disturbed a little so that its way back is seen too; the network
+    is fitted to what the teacher would have done, and the critic to the discounted rewards that followed.
+    In further rounds the network drives, and the teacher only tells what it would have done: so the network
+    learns the way back from where its own errors lead (DAgger: Ross, Gordon, Bagnell, AISTATS 2011).
+    Limits on accelerations are taken off the teacher: with them its command is the last one and a small
+    step, and a network that imitates this drifts away.
+
+    Raises
+    ------
+    ValueError
+        if the reference does not fit the scenario.
+    """
+    wanted = config.imitation
+    assert wanted is not None
+    scenario = envs.plants[0].scenario
+    fits("the teacher", scenario, action="twist", observation="tracking")
+    known = controller(wanted.controller)
+    free = {"acceleration_mm_s2": None, "yaw_acceleration_rad_s2": None}
+    known = known.model_copy(update={"limits": known.limits.model_copy(update=free)})
+    teacher = ReferencePolicy(known, scenario.control_period_s, scenario.preview_s)
+    generator = np.random.default_rng(model.seed)
+    rows: list[Rows] = []
+    for round_ in range(wanted.rounds):
+        driver = teacher if round_ == 0 else model
+        rows.append(_drive(model, envs, driver, teacher, wanted, generator))
+        seen, meant, returns = (
+            torch.from_numpy(np.concatenate(one)) for one in zip(*rows, strict=True)
+        )
+        _fit(model, seen, meant, returns, wanted.epochs, wanted.learning_rate)
+
+
+def _drive(
+    model: Any,
+    envs: FormationVecEnv,
+    driver: Any,
+    teacher: ReferencePolicy,
+    wanted: ImitationConfig,
+    generator: np.random.Generator,
+) -> Rows:
+    """What was seen while ``driver`` drove, what the teacher would have done, and what came of it."""
+    steps = -(-wanted.robot_steps // (envs.num_envs * wanted.rounds))
+    shape = (steps, envs.num_envs)
+    seen = np.empty((*shape, *model.observation_space.shape), dtype=np.float32)
+    meant = np.empty((*shape, *model.action_space.shape), dtype=np.float32)
+    rewards, dones = np.empty(shape, dtype=np.float32), np.empty(shape, dtype=np.bool_)
+    observations = envs.observations()
+    for k in range(steps):
+        seen[k] = observations
+        meant[k], _ = teacher.predict(observations)
+        given = meant[k]
+        if driver is not teacher:
+            given, _ = driver.predict(observations, deterministic=True)
+        given = given + wanted.noise * generator.standard_normal(given.shape)
+        observations, rewards[k], dones[k], _ = envs.step(np.clip(given, -1.0, 1.0))
+    model._last_obs = observations
+    model._last_episode_starts = np.asarray(dones[-1])
+    returns = np.empty_like(rewards)
+    last = rewards[-steps // 4 :].mean() / (1.0 - model.gamma)  # as if it went on like that
+    following = np.full(envs.num_envs, last, dtype=np.float32)
+    for k in reversed(range(steps)):
+        following = rewards[k] + model.gamma * np.where(dones[k], 0.0, following)
+        returns[k] = following
+    count = steps * envs.num_envs
+    return Rows(seen.reshape(count, -1), meant.reshape(count, -1), returns.ravel())
+
+
+def _fit(
+    model: Any,
+    seen: torch.Tensor,
+    meant: torch.Tensor,
+    returns: torch.Tensor,
+    epochs: int,
+    rate: float,
+) -> None:
+    policy = model.policy
+    kept = [parameter for name, parameter in policy.named_parameters() if name != "log_std"]
+    optimizer = torch.optim.Adam(kept, lr=rate)
+    spread = meant.std(dim=0) + 1e-6
+    scale = returns.std() + 1e-6
+    batches = -(-len(seen) // BATCH)
+    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimizer, epochs * batches)
+    for _ in range(epochs):
+        for rows in torch.randperm(len(seen)).split(BATCH):
+            mean = policy.get_distribution(seen[rows]).distribution.mean
+            value = policy.predict_values(seen[rows]).flatten()
+            loss = torch.square((mean - meant[rows]) / spread).mean()
+            loss = loss + torch.square((value - returns[rows]) / scale).mean()
+            optimizer.zero_grad()
+            loss.backward()
+            optimizer.step()
+            schedule.step()

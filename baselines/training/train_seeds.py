@@ -1,0 +1,120 @@
+"""Several training seeds at once, on this machine or on a Ray cluster."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from baselines.policies.card import CARD
+from baselines.runs.jobs import spread
+from baselines.training.config import TrainConfig
+from baselines.training.train import POLICY, check_folder, train
+from tlf_env.common.files import atomic
+
+STEPS = "robot_steps"  # the file in which a training tells how far it is
+
+
+class Shared(NamedTuple):
+    """What all seeds have in common."""
+
+    config: TrainConfig
+    folder: Path
+    command: str
+    threads: int
+
+
+def train_seeds(
+    config: TrainConfig,
+    seeds: Sequence[int],
+    folder: Path,
+    *,
+    processes: int = 1,
+    ray_address: str | None = None,
+    command: str = "",
+    progress: Callable[[int, int], None] | None = None,
+) -> list[dict[str, Any]]:
+    """Train with several seeds, each in ``folder/seed_N``; the best policy goes to ``folder``.
+
+    Parameters
+    ----------
+    processes
+        Seeds at a time on this machine; its cores are shared out among them.
+    progress
+        Called with the robot steps done, over all seeds, and those in all.
+
+    Returns
+    -------
+    list
+        What :func:`baselines.training.train.train` returns, in the order of the seeds.
+
+    Raises
+    ------
+    ValueError
+        as :func:`baselines.training.train.train` does; without a Ray cluster at the address.
+    KeyboardInterrupt
+        after an interrupt, once all trainings have written their checkpoints.
+    """
+    places = {seed: folder / f"seed_{seed}" for seed in seeds}
+    for seed, place in places.items():  # before any of them works for long
+        check_folder(config, seed, place)
+    total = config.robot_steps * len(places)
+
+    def tell() -> None:
+        if progress is not None:
+            progress(sum(_steps_done(place) for place in places.values()), total)
+
+    def train_and_tell(shared: Shared, seed: int) -> dict[str, Any]:
+        return _train_one(shared, seed, tell)
+
+    elsewhere = ray_address is not None or processes > 1
+    threads = 1 if ray_address else max(1, (os.cpu_count() or 1) // processes)
+    curves = {}
+    for curve in spread(
+        _train_one if elsewhere else train_and_tell,
+        Shared(config, folder, command, threads),
+        list(places),
+        processes=processes,
+        ray_address=ray_address,
+        meanwhile=tell,
+    ):
+        curves[curve["seed"]] = curve
+    best = min(curves, key=lambda seed: kept(curves[seed])["score_mm"])
+    for name in (POLICY, str(Path(POLICY).with_suffix(CARD))):
+        with atomic(folder / name, "wb") as file:
+            file.write((places[best] / name).read_bytes())
+    return [curves[seed] for seed in seeds]
+
+
+def _train_one(
+    shared: Shared, seed: int, tell: Callable[[], None] = lambda: None
+) -> dict[str, Any]:
+    """One seed; how far it is stands in a file, so that another process or machine can tell."""
+    folder = shared.folder / f"seed_{seed}"
+
+    def progress(done: int, total: int) -> None:
+        with atomic(folder / STEPS) as file:
+            file.write(f"{done}\n")
+        tell()
+
+    return train(
+        shared.config,
+        seed,
+        folder,
+        command=shared.command,
+        threads=shared.threads,
+        progress=progress,
+    )
+
+
+def _steps_done(folder: Path) -> int:
+    try:
+        return int((folder / STEPS).read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return 0
+
+
+def kept(curve: dict[str, Any]) -> dict[str, Any]:
+    """The evaluation of the policy that was kept."""
+    return min(curve["evaluations"], key=lambda one: one["score_mm"])

@@ -1,0 +1,1 @@
+"""The search for a controller's gains, limits and filter parameters."""

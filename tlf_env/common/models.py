@@ -1,0 +1,30 @@
+"""Frozen, validated models, and the kinds of number that they hold."""
+
+from __future__ import annotations
+
+from typing import Annotated, Any
+
+from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+
+
+def no_switch(value: Any) -> Any:
+    """The value, unless it is True or False, which Python would count as 1 or 0.
+
+    Raises
+    ------
+    ValueError
+        for True and False.
+    """
+    if isinstance(value, bool):
+        raise ValueError(f"must be a number, got {value!r}")
+    return value
+
+
+Positive = Annotated[FiniteFloat, BeforeValidator(no_switch), Field(gt=0)]
+NonNegative = Annotated[FiniteFloat, BeforeValidator(no_switch), Field(ge=0)]
+
+
+class Frozen(BaseModel):
+    """A model whose instances never change and that refuses unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)

@@ -1,0 +1,366 @@
+"""Many formations at once, one compiled call a step: no contact between robots, no Python between them."""
+
+from __future__ import annotations
+
+import os
+import secrets
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tlf_env.engine import drivers, judging
+from tlf_env.engine.excerpt import Excerpt, empty_excerpt
+from tlf_env.engine.formation import NO_POSES, reference_table, refusal, state_rows
+from tlf_env.engine.layout import Arrays, make_arrays, make_variants
+from tlf_env.engine.settings import settings
+from tlf_env.engine.starting import STARTED
+from tlf_env.numerics.philox import MAX_SEED, checked_seed
+from tlf_env.onboard.parts import real_numbers
+from tlf_env.task.scenario import Scenario, load_scenario
+
+Source = str | Path | Mapping[str, Any] | Scenario
+
+MAY_DIFFER = ("name", "robots", "robot", "wheel_loop", "ekf", "ekf_slip", "disturbance")
+
+
+class BatchPlant:
+    """Formations side by side, as many as memory holds.
+
+    Formation k seeded s is, bit for bit, the single environment seeded s + k on the plant ``batch``,
+    and on ``pymunk`` until two outlines meet: here they pass through each other, and the robots are
+    marked as ``touched`` in the same control step. Neither the number of formations, nor the threads, nor
+    resets of other formations change a bit. Units: mm, s, rad. Arrays are views of the present state.
+
+    Parameters
+    ----------
+    scenario
+        What :func:`~tlf_env.task.scenario.load_scenario` takes, or a sequence of it: formation k then
+        runs scenario k modulo their number. They may differ in ``robots``' parameters, ``robot``,
+        ``wheel_loop``, ``ekf``, ``ekf_slip`` and ``disturbance``. A ``kinematic`` plant stays one.
+    formations
+        How many.
+    threads
+        How many work on a step; None takes one for each core.
+    mixture
+        True, or a share for each scenario: every episode of a formation draws its scenario, by its seed.
+    **overrides
+        Fields of all scenarios; ``disturbance_level`` too.
+
+    Raises
+    ------
+    ValueError
+        for a scenario that cannot run in a batch (parts of one's own, ``adversary``), scenarios that
+        differ elsewhere, or a number out of range; naming the field.
+    """
+
+    def __init__(
+        self,
+        scenario: Source | Sequence[Source],
+        formations: int,
+        *,
+        threads: int | None = 1,
+        mixture: bool | Sequence[float] = False,
+        **overrides: Any,
+    ) -> None:
+        if not isinstance(scenario, Sequence) or isinstance(scenario, str):
+            scenario = [scenario]
+        self.scenarios = _alike([_for_lanes(source, overrides) for source in scenario])
+        self.formations = _positive("formations", formations)
+        self.threads = _positive("threads", os.cpu_count() or 1 if threads is None else threads)
+        table = reference_table(self.scenario)
+        self.arrays: Arrays = make_arrays(self.scenarios, table, self.formations)
+        self._variants = make_variants(self.scenarios, _shares(mixture, len(self.scenarios)))
+        each = [settings(one) for one in self.scenarios]
+        self._settings = each[0]._replace(changing=any(one.changing for one in each))
+        self._seeded = np.zeros(self.formations, dtype=np.bool_)
+        self._nothing = empty_excerpt(self.arrays, 0, 0)
+        self._pool: ThreadPoolExecutor | None = None
+
+    @property
+    def scenario(self) -> Scenario:
+        """The first scenario; in all but :data:`MAY_DIFFER` it speaks for the others."""
+        return self.scenarios[0]
+
+    def reset(
+        self, seed: int | Sequence[int] | None = None, mask: np.ndarray | None = None
+    ) -> None:
+        """Start an episode in the formations of the mask.
+
+        Parameters
+        ----------
+        seed
+            Formation k gets ``seed`` + k, or ``seed[k]`` of a sequence. Without a seed its next episode
+            begins, or the first of a random seed where there was none.
+        mask
+            ``(formations,)`` bool; all if None.
+
+        Raises
+        ------
+        ValueError
+            for a seed out of its range, a mask of another shape, or a formation that cannot start; in
+            the last case the formations of the mask have to be reset again.
+        """
+        a = self.arrays
+        chosen = self._checked_mask(mask)
+        fresh = chosen & ~self._seeded if seed is None else chosen
+        if fresh.any():
+            if seed is None:
+                seed = secrets.randbelow(MAX_SEED - self.formations)
+            seeds = self._checked_seeds(seed)
+            a.seeds[fresh] = seeds[fresh]
+        a.clock[chosen & ~fresh, 2] += 1
+        a.clock[fresh, 2] = 0
+        self._seeded |= chosen
+        self._start(chosen)
+
+    def restart(self, mask: np.ndarray) -> None:
+        """Start the present episode of the formations of the mask, ``(formations,)`` bool, over again."""
+        self._start(self._checked_mask(mask))
+
+    def _start(self, chosen: np.ndarray) -> None:
+        a = self.arrays
+        result, robot, lane = drivers.start(a, self._variants, chosen, NO_POSES, self._settings)
+        if result != STARTED:
+            why = refusal(a, self._variants, result, robot, lane)
+            raise ValueError(f"formation {lane}: {why}")
+        drivers.look(a, chosen, True, self._settings)
+
+    def excerpt(self, robot: int) -> Excerpt:
+        """Room for what there is to tell of one robot in each formation, not yet written."""
+        return empty_excerpt(self.arrays, robot, self.formations)
+
+    def write_excerpt(self, out: Excerpt, mask: np.ndarray | None = None) -> None:
+        """Write what there is to tell of the formations of the mask; all if None."""
+        drivers.excerpt_of(self.arrays, self._checked_mask(mask), out)
+
+    def reset_finished(self) -> np.ndarray:
+        """Start the next episode wherever one ended in the last step; returns their mask."""
+        ended = self.ended
+        if ended.any():
+            self.reset(mask=ended)
+        return ended
+
+    def step(self, actions: np.ndarray, excerpt: Excerpt | None = None) -> None:
+        """Advance all formations by one control period.
+
+        A formation whose episode has ended goes on if it is not reset, up to its horizon.
+
+        Parameters
+        ----------
+        actions
+            ``(formations, robots, 2)``.
+        excerpt
+            Where to write what there is to tell of one robot in each formation, if anywhere.
+
+        Raises
+        ------
+        ValueError
+            for actions of another shape or not finite, naming formation and robot; nothing has changed.
+        RuntimeError
+            if a formation was never reset, or is at its horizon.
+        """
+        a, s = self.arrays, self._settings
+        given = real_numbers(actions)
+        if given is None:
+            raise ValueError(
+                f"actions must be real numbers in the shape {a.actions.shape}, got "
+                f"{' '.join(repr(actions).split()):.60}"
+            )
+        if given.shape != a.actions.shape:
+            raise ValueError(f"actions must have the shape {a.actions.shape}, got {given.shape}")
+        if not np.isfinite(given).all():
+            lane, r, _ = np.argwhere(~np.isfinite(given))[0]
+            raise ValueError(
+                f"formation {lane}, robot_{r}: the action must be finite, got {given[lane, r].tolist()}"
+            )
+        if not self._seeded.all() or (a.clock[:, 1] >= s.horizon).any():
+            over = np.flatnonzero(~self._seeded | (a.clock[:, 1] >= s.horizon))
+            raise RuntimeError(f"formation {over[0]}: call reset() before step()")
+        a.actions[:] = given
+        threads = min(self.threads, -(-self.formations // drivers.LANES_AT_ONCE))
+        left = drivers.lanes_to_step(0, self.formations, threads)
+        work = (a, left, self._nothing if excerpt is None else excerpt, s)
+        helpers = [self._others().submit(drivers.control_step, *work) for _ in range(threads - 1)]
+        drivers.control_step(*work)
+        for helper in helpers:
+            helper.result()
+
+    def _others(self) -> ThreadPoolExecutor:
+        """The other threads, kept from step to step."""
+        if self._pool is None:
+            self._pool = ThreadPoolExecutor(self.threads - 1)
+        return self._pool
+
+    @property
+    def observations(self) -> np.ndarray:
+        """(formations, robots, entries)."""
+        a = self.arrays
+        sensor = self.scenario.observation == "sensor"
+        return a.sensor_observations if sensor else a.observations
+
+    @property
+    def rewards(self) -> np.ndarray:
+        """(formations, robots)."""
+        return self.arrays.rewards
+
+    @property
+    def terms(self) -> np.ndarray:
+        """Reward terms, (formations, robots, :class:`~tlf_env.task.reward.RewardTerms`)."""
+        return self.arrays.terms
+
+    @property
+    def infos(self) -> np.ndarray:
+        """(formations, robots, :class:`~tlf_env.engine.layout.Info`)."""
+        return self.arrays.infos
+
+    @property
+    def lost(self) -> np.ndarray:
+        """(formations, robots) bool, at any time so far in the episode."""
+        return self.arrays.lost
+
+    @property
+    def touched(self) -> np.ndarray:
+        """(formations, robots) bool, at any time so far in the episode."""
+        return self.arrays.touched
+
+    @property
+    def lost_now(self) -> np.ndarray:
+        """(formations, robots) bool, for the first time in this step."""
+        return self.arrays.lost_now
+
+    @property
+    def touched_now(self) -> np.ndarray:
+        """(formations, robots) bool, for the first time in this step."""
+        return self.arrays.touched_now
+
+    @property
+    def ends(self) -> np.ndarray:
+        """Why the episode ended in this step, (formations, robots), places in ``END_REASONS``."""
+        return self.arrays.ends
+
+    @property
+    def terminated(self) -> np.ndarray:
+        """(formations, robots) bool: who ended the episode in this step, as ``end_on`` says."""
+        return judging.terminated(self.arrays.ends)
+
+    @property
+    def truncated(self) -> np.ndarray:
+        """(formations, robots) bool: whose episode another robot or the horizon ended in this step."""
+        return judging.truncated(self.arrays.ends)
+
+    @property
+    def ended(self) -> np.ndarray:
+        """(formations,) bool: whose episode ended in this step."""
+        return (self.arrays.ends != 0).any(axis=1)
+
+    @property
+    def applied(self) -> np.ndarray:
+        """The channels' last values, (formations, robots, channel), channels as in ``PATHS``."""
+        return self.arrays.applied[:, :, : self.formations].transpose(2, 1, 0)
+
+    @property
+    def step_counts(self) -> np.ndarray:
+        """(formations,): control steps since the start of the episode."""
+        return self.arrays.clock[:, 1]
+
+    @property
+    def episodes(self) -> np.ndarray:
+        """(formations,): how many episodes came before, of the same seed."""
+        return self.arrays.clock[:, 2]
+
+    @property
+    def seeds(self) -> np.ndarray:
+        """(formations,)."""
+        return self.arrays.seeds
+
+    @property
+    def scenario_numbers(self) -> np.ndarray:
+        """(formations,): which of ``scenarios`` each runs."""
+        return self.arrays.variants
+
+    def state(self) -> np.ndarray:
+        """The truth, (formations, robots, :class:`~tlf_env.engine.layout.State`), in physical units."""
+        return state_rows(self.arrays)
+
+    @property
+    def memory_per_formation_bytes(self) -> int:
+        """What one formation more costs."""
+        one, two = (
+            sum(array.nbytes for array in make_arrays(self.scenarios, self.arrays.table, lanes))
+            for lanes in (1, 2)
+        )
+        return two - one
+
+    def _checked_mask(self, mask: np.ndarray | None) -> np.ndarray:
+        if mask is None:
+            return np.ones(self.formations, dtype=np.bool_)
+        chosen = np.asarray(mask)
+        if chosen.shape != (self.formations,) or chosen.dtype != np.bool_:
+            raise ValueError(
+                f"mask must be ({self.formations},) bool, got {chosen.shape} {chosen.dtype}"
+            )
+        return chosen.copy()
+
+    def _checked_seeds(self, seed: int | Sequence[int]) -> np.ndarray:
+        if not isinstance(seed, Sequence | np.ndarray):
+            first = checked_seed(seed)
+            checked_seed(first + self.formations - 1)
+            return first + np.arange(self.formations)
+        seeds = [checked_seed(one) for one in seed]
+        if len(seeds) != self.formations:
+            raise ValueError(f"seed: {len(seeds)} seeds for {self.formations} formations")
+        return np.array(seeds, dtype=np.int64)
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {**self.__dict__, "_pool": None}
+
+
+def _for_lanes(source: Source, overrides: Mapping[str, Any]) -> Scenario:
+    """A scenario of a plant without contact."""
+    loaded = load_scenario(source, **overrides)
+    if loaded.plant == "pymunk":
+        loaded = load_scenario(loaded, plant="batch")
+    loaded.check_lanes()
+    return loaded
+
+
+def _alike(scenarios: list[Scenario]) -> tuple[Scenario, ...]:
+    """The scenarios, which must be alike but for :data:`MAY_DIFFER`."""
+    if not scenarios:
+        raise ValueError("scenario: the sequence is empty")
+    first = scenarios[0]
+    for number, other in enumerate(scenarios):
+        if other.robot_count != first.robot_count:
+            raise ValueError(
+                f"scenario {number}: robots is {other.robot_count}, that of the first "
+                f"{first.robot_count}; a batch needs the same number"
+            )
+        for field in Scenario.model_fields:
+            mine, theirs = getattr(first, field), getattr(other, field)
+            if field not in MAY_DIFFER and mine != theirs:
+                raise ValueError(
+                    f"scenario {number}: {field} is {theirs!r}, that of the first {mine!r}; the "
+                    f"scenarios of a batch may differ in {', '.join(MAY_DIFFER)}"
+                )
+    return tuple(scenarios)
+
+
+def _shares(mixture: bool | Sequence[float], scenarios: int) -> list[float]:
+    """Shares that sum to 1, or none."""
+    if mixture is False:
+        return []
+    weights = np.ones(scenarios) if mixture is True else np.asarray(mixture, dtype=np.float64)
+    if weights.shape != (scenarios,) or not (weights >= 0).all() or not 0 < weights.sum() < np.inf:
+        raise ValueError(
+            f"mixture {mixture!r} must be True or {scenarios} shares, at least 0 and not all 0"
+        )
+    return (weights / weights.sum()).tolist()
+
+
+def _positive(name: str, value: int) -> int:
+    if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
+        raise ValueError(f"{name} {value!r} must be a whole number, at least 1")
+    return int(value)

@@ -1,0 +1,80 @@
+"""What the drivers know of a scenario, as plain numbers."""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+from tlf_env.disturbances.model import changes_within_episode
+from tlf_env.onboard.observer import ObserverParameters
+from tlf_env.onboard.tracking import ControllerRow, controller, controller_row
+from tlf_env.task.measures import TIME_GAP_WINDOW_S
+from tlf_env.task.scenario import Scenario
+
+EKF, TRUTH, EXTERNAL, EKF_SLIP = range(4)
+
+
+class Settings(NamedTuple):
+    """Numbers of a scenario that all robots share."""
+
+    kinematic: bool
+    collides: bool  # robots that are near are stepped through a space with contact
+    substeps: int
+    dt: float  # physics period, s
+    period: float  # control period, s
+    gap: int  # control steps of the time gap
+    lookahead: int  # control steps of the longest preview
+    horizon: int  # control steps of an episode
+    spacing: float  # mm between neighbours at the start
+    window: int  # control steps around one gap ago in which the time gap is measured
+    observer_gain: float  # 1/s
+    smoothing: float  # s
+    lost_beyond: float  # mm
+    end_on_lost: bool
+    end_on_touched: bool
+    estimator: int  # EKF, TRUTH, EXTERNAL or EKF_SLIP
+    has_parts: bool  # objects in Python that are called between the substeps
+    external_wheel_loop: bool
+    external_observer: bool
+    cooperative: bool  # every robot gets the formation's mean reward
+    changing: bool  # whether a channel of every substep varies within an episode
+    adversary: bool
+    base: ControllerRow  # of the twist that a residual is added to
+    residual_fade: float  # mm; 0 where a residual counts fully near the reference
+    residual_reach: float  # mm; infinity where it does far from it
+
+
+def settings(scenario: Scenario) -> Settings:
+    """The scenario's numbers as the drivers take them."""
+    observer = scenario.observer
+    paper = observer if isinstance(observer, ObserverParameters) else ObserverParameters()
+    kinds = {"ekf": EKF, "ekf-slip": EKF_SLIP, "truth": TRUTH}
+    return Settings(
+        kinematic=scenario.plant == "kinematic",
+        collides=scenario.plant == "pymunk",
+        substeps=scenario.substeps,
+        dt=scenario.physics_period_s,
+        period=scenario.control_period_s,
+        gap=scenario.gap_steps,
+        lookahead=max(scenario.preview_steps, default=0),
+        horizon=scenario.horizon_steps,
+        spacing=scenario.start_spacing_mm,
+        window=round(TIME_GAP_WINDOW_S / scenario.control_period_s),
+        observer_gain=paper.gain_per_s,
+        smoothing=paper.smoothing_s,
+        lost_beyond=scenario.lost_beyond_mm,
+        end_on_lost="lost" in scenario.end_on,
+        end_on_touched="touched" in scenario.end_on,
+        estimator=kinds.get(scenario.estimator, EXTERNAL),
+        has_parts=bool(scenario.part_paths),
+        external_wheel_loop=isinstance(scenario.wheel_loop, str),
+        external_observer=isinstance(observer, str),
+        cooperative=scenario.cooperative,
+        changing=changes_within_episode(scenario.disturbance),
+        adversary=scenario.adversary,
+        base=controller_row(
+            controller(scenario.residual_base), scenario.control_period_s, scenario.preview_s
+        ),
+        residual_fade=scenario.residual_fade_mm,
+        residual_reach=scenario.residual_reach_mm or math.inf,
+    )

@@ -1,0 +1,158 @@
+"""Geometry of a picture, and soft shapes, lines and text on a pygame surface. Lengths are in canvas px."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tlf_env.rendering.looks import Colour
+
+FLOOR: Colour = (252, 252, 250)
+INK: Colour = (60, 62, 66)
+SOFT_PX = 0.7  # how far a soft edge reaches
+BLOCK = 6  # pieces of one colour in a line
+CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 37)) for f in (np.cos, np.sin)], axis=-1)
+
+
+class View(NamedTuple):
+    """A window of the canvas and the floor in it; lengths in canvas px unless said."""
+
+    left: int
+    top: int
+    width: int
+    height: int
+    corner_mm: tuple[float, float]  # x of the left edge, y of the top edge
+    scale: float  # px per mm
+    pen: float  # px per px of the design
+
+    def px(self, points_mm: np.ndarray) -> np.ndarray:
+        """Canvas coordinates of points ``(..., 2)``; half a px on, since pygame cuts fractions off."""
+        offset = (self.left + 0.5, self.top + 0.5)
+        return (points_mm - self.corner_mm) * (self.scale, -self.scale) + offset
+
+    def place(self, x_mm: float, y_mm: float, theta_rad: float) -> Place:
+        """A pose on the canvas."""
+        x = self.left + (x_mm - self.corner_mm[0]) * self.scale
+        y = self.top + (self.corner_mm[1] - y_mm) * self.scale
+        return Place(x, y, theta_rad, self.scale)
+
+    def shows(self, px: np.ndarray, room: float = 0.0) -> np.ndarray:
+        """Which canvas points lie in the window or less than ``room`` beside it; NaN never does."""
+        x, y = px[..., 0] - self.left, px[..., 1] - self.top
+        return (x > -room) & (x < self.width + room) & (y > -room) & (y < self.height + room)
+
+    @property
+    def rect(self) -> tuple[int, int, int, int]:
+        """The window, as pygame takes rectangles."""
+        return self.left, self.top, self.width, self.height
+
+
+class Place(NamedTuple):
+    """A pose on the canvas and the scale there; its own axes are e (right) and f (forward), in mm."""
+
+    x: float  # canvas px, to the right
+    y: float  # canvas px, down
+    theta: float  # from up, counter-clockwise
+    scale: float  # px per mm
+
+    def px(self, points: Iterable[tuple[float, float]]) -> list[tuple[float, float]]:
+        """Canvas coordinates of points (e, f)."""
+        sin, cos = self.scale * math.sin(self.theta), self.scale * math.cos(self.theta)
+        x, y = self.x, self.y
+        return [(x + e * cos - f * sin, y - e * sin - f * cos) for e, f in points]
+
+    def at(self, e: float, f: float, turn: float = 0.0) -> Place:
+        """A pose relative to this one."""
+        ((x, y),) = self.px([(e, f)])
+        return Place(x, y, self.theta + turn, self.scale)
+
+
+class Shapes:
+    """Draws on a canvas, whose pixels are those of :class:`View` and :class:`Place`.
+
+    Parameters
+    ----------
+    pg
+        The module pygame.
+    canvas
+        The surface to draw on.
+    font
+        That of the labels.
+    """
+
+    def __init__(self, pg: Any, canvas: Any, font: Any) -> None:
+        self._pg, self._canvas, self._font = pg, canvas, font
+
+    def label(self, text: str, ground: Colour = FLOOR, **anchor: Any) -> None:
+        """Text on the canvas; ``anchor`` as pygame names a rectangle's points."""
+        image = self._font.render(text, True, INK, ground)
+        self._canvas.blit(image, image.get_rect(**anchor))
+
+    def fill(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
+        """A polygon; pygame cuts fractions off."""
+        polygon = [(x + 0.5, y + 0.5) for x, y in points]
+        self._pg.draw.polygon(self._canvas, colour, polygon)
+
+    def _smooth(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
+        """A polygon with a soft edge around it, about 0.7 px wide."""
+        self.fill(points, colour)
+        self._pg.draw.aalines(self._canvas, colour, True, points)
+
+    def bar(self, place: Place, size: tuple[float, float], colour: Colour) -> None:
+        """A rectangle around a place: its sides along e and f."""
+        e, f = (max(side / 2 - SOFT_PX, 0.3) / place.scale for side in size)
+        self._smooth(place.px([(-e, -f), (e, -f), (e, f), (-e, f)]), colour)
+
+    def cross(self, place: Place, arm: float, width: float, colour: Colour) -> None:
+        """Two bars, along e and along f, that reach ``arm`` from the place."""
+        self.bar(place, (2 * arm, width), colour)
+        self.bar(place, (width, 2 * arm), colour)
+
+    def disc(self, place: Place, radius: float, colour: Colour) -> None:
+        """A full circle."""
+        points = (radius - SOFT_PX) * CIRCLE + (place.x, place.y)
+        self._smooth(points.tolist(), colour)
+
+    def ring(self, place: Place, radius: float, width: float, colour: Colour) -> None:
+        """A circle's line as one polygon: round outside, and back inside."""
+        half, middle = max(width / 2 - SOFT_PX, 0.3), (place.x, place.y)
+        outside = ((radius + half) * CIRCLE + middle).tolist()
+        inside = ((radius - half) * CIRCLE[::-1] + middle).tolist()
+        self._smooth(outside + inside, colour)
+
+    def lines(
+        self,
+        view: View,
+        points_mm: np.ndarray,
+        width: np.ndarray,
+        colours: Sequence[Sequence[Colour]],
+    ) -> None:
+        """Lines through ``(point, line, 2)``, ``width`` wide at each point, first blocks first.
+
+        A block is ``BLOCK`` pieces long; ``colours`` holds one for each block and line.
+        """
+        points = view.px(points_mm)
+        along = np.gradient(points, axis=0)
+        length = np.linalg.norm(along, axis=-1, keepdims=True)
+        along = np.divide(along, length, out=np.zeros_like(along), where=length > 0)
+        side = along[..., ::-1] * (-0.5, 0.5) * width[:, None, None]
+        left, right = points + side, points - side
+        starts = np.arange(0, len(points) - 1, BLOCK)
+        near = np.logical_or.reduceat(view.shows(points, view.width / 2), starts)
+        possible = np.logical_and.reduceat(view.shows(points, 8 * view.width), starts)
+        for block, i in np.argwhere(near & possible).tolist():
+            here = slice(starts[block], starts[block] + BLOCK + 1)
+            outline = np.concatenate([left[here, i], right[here, i][::-1]]).tolist()
+            colour, half = colours[block][i], len(outline) // 2
+            self.fill(outline, colour)
+            self._pg.draw.aalines(self._canvas, colour, False, outline[:half])
+            self._pg.draw.aalines(self._canvas, colour, False, outline[half:])
+
+
+def mixed(of: Colour, with_: Colour, part: float) -> Colour:
+    """A colour between two others."""
+    r, g, b = (round(a + part * (c - a)) for a, c in zip(of, with_, strict=True))
+    return r, g, b

@@ -1,0 +1,500 @@
+"""The formation from above, to scale, drawn with pygame-ce (the extra ``view``) onto plain surfaces.
+
+Everything is drawn twice as large as it is shown and scaled down: that smooths every edge.
+"""
+
+from __future__ import annotations
+
+import math
+import os
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from tlf_env.physics.parameters import RobotParameters
+from tlf_env.rendering.drawing import BLOCK, FLOOR, INK, Place, Shapes, View, mixed
+from tlf_env.rendering.looks import (
+    CASTOR_WIDTH_MM,
+    DRIVE_WHEEL_WIDTH_MM,
+    NOSE,
+    Colour,
+    robot_colours,
+)
+from tlf_env.rendering.scene import Scene
+
+RENDER_MODES = ("rgb_array", "human")
+OVERSAMPLING = 2
+DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and grow with it
+SMALLEST_PX = 64
+
+GRID: Colour = (222, 224, 226)
+HALF_GRID: Colour = (239, 240, 241)
+PATH: Colour = (188, 190, 193)
+TYRE: Colour = (48, 50, 54)
+TREAD: Colour = (205, 208, 212)
+ALARM: Colour = (236, 0, 84)  # slip, lost, touched: no robot has it
+SLIPPERY: Colour = (214, 233, 246)
+GRIPPY: Colour = (247, 232, 210)
+
+AXLE_MM = 8.0  # for the picture only
+TREADS, TREAD_RADII = 4, 0.2  # few: more would seem to turn backwards at top speed and 20 frames/s
+# Where a slipping wheel's mark begins, and where it is strongest.
+SLIP_SHOWN_MM_S, SLIP_FULL_MM_S = 2.0, 60.0
+
+ARM_RADII = 0.25  # arms of the reference's cross
+MARGIN_RADII = 3.0  # room around the path, in outline radii
+MOST_START_MM = 1500.0  # how far the view grows towards robots that start off the path
+TRAIL_POINTS = 96  # of one trail
+PATH_POINTS = 1000
+TRAIL_PX, PATH_PX = 5.0, 2.0
+CLOSE_UP_PX, CLOSE_UP_RADII = 184, 3.2  # side of the close-up; how much floor, in outline radii
+CLOSE_UP_PEN = 1.3  # its lines against the others
+EDGE_PX, LINE_PX, TABLE_PX = 14, 18, 230
+PLATE_ALPHA = 190  # of the ground under the table
+SMALLEST_TEXT, SMALLEST_CLOSE_UP = 0.6, 0.6  # of their size in the design
+TEXT_PX, TIME_PX = 19, 27  # of pygame's own font, whose letters are two thirds of that
+GRID_PX = 90  # least side of a grid square
+COLUMNS_PX = (18, 140, 208, 218)  # name, error, time gap, flags
+
+
+class Renderer:
+    """Draws scenes of one formation, and remembers where the robots were.
+
+    Parameters
+    ----------
+    robots
+        Each robot's measures.
+    path_mm
+        The leader's whole reference, ``(k, 2)``. The view holds it and the robots' start, and stays;
+        a robot that leaves it shows as an arrow at the edge.
+    mode
+        ``"rgb_array"``: frames as arrays, without any display. ``"human"``: a window, which waits so
+        that there are at most ``fps`` frames a second.
+    fps
+        Frames per second.
+    size_px
+        Width and height of the picture.
+    trail_s
+        How far back the robots' trails go.
+    patches
+        Round patches of other friction: mappings of ``x_mm``, ``y_mm``, ``radius_mm`` and ``scale``.
+    close_up
+        The robot to draw large in a corner, or None. The last, if there are not so many.
+
+    Raises
+    ------
+    ImportError
+        without pygame, saying how to install it.
+    ValueError
+        for an unknown mode or a picture too small to draw on.
+    """
+
+    def __init__(
+        self,
+        robots: Sequence[RobotParameters],
+        path_mm: np.ndarray,
+        *,
+        mode: str,
+        fps: float,
+        size_px: tuple[int, int] = DESIGN_SIZE_PX,
+        trail_s: float = 20.0,
+        patches: Sequence[Mapping[str, float]] = (),
+        close_up: int | None = 1,
+    ) -> None:
+        if mode not in RENDER_MODES:
+            raise ValueError(f"mode {mode!r} is not one of {', '.join(RENDER_MODES)}")
+        if min(size_px) < SMALLEST_PX:
+            raise ValueError(f"size_px {size_px} must be at least {SMALLEST_PX} each way")
+        self._pg = _pygame()
+        self._robots = list(robots)
+        self._colours = robot_colours(len(robots))
+        self._faded = [
+            [mixed(FLOOR, colour, part) for colour in self._colours]
+            for part in np.linspace(0.15, 0.85, 32).tolist()
+        ]
+        self._patches = list(patches)
+        self._fps, self._trail_s = fps, trail_s
+        self._close_up = None if close_up is None else min(close_up, len(robots) - 1)
+        self.begin(path_mm)
+        self._open, self._window = True, mode == "human"
+        if self._window:
+            self._open_window(size_px)
+        self._resize(size_px)
+
+    def begin(self, path_mm: np.ndarray) -> None:
+        """Forget the last episode: trails and view are made anew from the next scene on.
+
+        Parameters
+        ----------
+        path_mm
+            The leader's whole reference in the episode that begins, ``(k, 2)``.
+        """
+        stride = max(1, len(path_mm) // PATH_POINTS)
+        self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
+        self._trail: list[tuple[float, np.ndarray]] = []  # time, (robot, 2)
+        self._background: Any = None
+
+    def draw(self, scene: Scene) -> np.ndarray | None:
+        """Draw a scene; one whose time goes back begins a new episode on the same path.
+
+        Returns a fresh uint8 array ``(H, W, 3)`` in the mode ``"rgb_array"``, else None. Once closed,
+        nothing happens.
+        """
+        if self._window:
+            self._handle_events()
+        if not self._open:
+            return None
+        self._remember(scene)
+        self._background = self._background or self._draw_background()
+        self._canvas.blit(self._background, (0, 0))
+        self._draw_robots(self._view, scene)
+        self._draw_arrows(scene)
+        self._draw_close_up(scene)
+        self._pg.transform.smoothscale(self._canvas, self._size_px, self._picture)
+        self._write(scene)
+        if self._window:
+            self._show()
+            return None
+        return self._pixels()
+
+    def close(self) -> None:
+        """Close the window. Drawing does nothing from now on."""
+        if self._open and self._window:
+            self._pg.display.quit()
+        self._open = False
+
+    # Picture and window
+
+    def _resize(self, size_px: tuple[int, int]) -> None:
+        pg = self._pg
+        self._size_px = (max(size_px[0], SMALLEST_PX), max(size_px[1], SMALLEST_PX))
+        self._canvas = pg.Surface([OVERSAMPLING * side for side in self._size_px], 0, 32)
+        self._picture = pg.Surface(self._size_px, 0, 32)
+        width, height = self._size_px
+        self._unit = min(width / DESIGN_SIZE_PX[0], height / DESIGN_SIZE_PX[1])
+        self._text_unit = max(self._unit, SMALLEST_TEXT)
+        self._focus = self._close_up if self._unit >= SMALLEST_CLOSE_UP else None
+        self._font, self._time_font, canvas_font = (
+            pg.font.Font(None, round(size * self._text_unit))
+            for size in (TEXT_PX, TIME_PX, TEXT_PX * OVERSAMPLING)
+        )
+        self._shapes = Shapes(pg, self._canvas, canvas_font)
+        self._background = None
+
+    def _pixels(self) -> np.ndarray:
+        width, height = self._size_px
+        data = bytearray(self._pg.image.tobytes(self._picture, "RGB"))
+        return np.frombuffer(data, np.uint8).reshape(height, width, 3)
+
+    def _open_window(self, size_px: tuple[int, int]) -> None:
+        self._pg.display.init()
+        self._pg.display.set_mode(size_px, self._pg.RESIZABLE)
+        self._pg.display.set_caption("tlf_env")
+        self._clock = self._pg.time.Clock()
+
+    def _handle_events(self) -> None:
+        if not self._open:
+            return
+        if not self._pg.display.get_init() or self._pg.event.get(self._pg.QUIT):
+            self.close()
+            return
+        self._pg.event.get()
+        size_px = self._pg.display.get_window_size()
+        if size_px != self._size_px and min(size_px) >= SMALLEST_PX:
+            self._resize(size_px)
+
+    def _show(self) -> None:
+        self._pg.display.get_surface().blit(self._picture, (0, 0))
+        self._pg.display.flip()
+        self._clock.tick(self._fps)
+
+    # Memory
+
+    def _remember(self, scene: Scene) -> None:
+        """Lengthen the trails: about ``TRAIL_POINTS`` points evenly in time, and the robots' place now."""
+        places = np.stack([scene.x_mm, scene.y_mm], axis=-1)
+        if not self._trail or scene.t_s < self._trail[-1][0]:
+            self._trail.clear()
+            self._start_mm, self._background = places, None
+        spacing_s = self._trail_s / TRAIL_POINTS
+        if len(self._trail) > 1 and self._trail[-1][0] - self._trail[-2][0] < spacing_s:
+            self._trail.pop()
+        self._trail.append((scene.t_s, places))
+        while self._trail[0][0] < scene.t_s - self._trail_s:
+            self._trail.pop(0)
+
+    # Floor
+
+    def _fit(self) -> View:
+        """The view of path and start: in the middle, or farther right, clear of the text."""
+        room = MARGIN_RADII * max(robot.outline_radius_mm for robot in self._robots)
+        low, high = self._path_mm.min(axis=0), self._path_mm.max(axis=0)
+        start = self._start_mm[np.isfinite(self._start_mm).all(axis=-1)]
+        start = np.clip(start, low - MOST_START_MM, high + MOST_START_MM)
+        shown = np.concatenate([self._path_mm, start])
+        low, high = shown.min(axis=0) - room, shown.max(axis=0) + room
+        width, height = self._canvas.get_size()
+        scale = min(width / (high[0] - low[0]), height / (high[1] - low[1]))
+        pen = OVERSAMPLING * self._unit
+        spare = width - (high[0] - low[0]) * scale
+        left = low[0] - max(spare / 2, min(spare, TABLE_PX * pen)) / scale
+        top = (low[1] + high[1] + height / scale) / 2
+        return View(0, 0, width, height, (float(left), float(top)), float(scale), pen)
+
+    def _draw_background(self) -> Any:
+        self._view = self._fit()
+        step_mm = round_length(GRID_PX * self._view.pen / self._view.scale)
+        self._draw_floor(self._view, step_mm)
+        self._draw_scale_bar(self._view, step_mm)
+        if self._focus is not None:
+            self._draw_legend()
+        return self._canvas.copy()
+
+    def _draw_floor(self, view: View, step_mm: float) -> None:
+        self._canvas.fill(FLOOR, view.rect)
+        for patch in self._patches:
+            self._draw_patch(view, patch)
+        for colour, phase in ((HALF_GRID, 0.5), (GRID, 0.0)):
+            columns, rows = _grid_lines(view, step_mm, phase)
+            for x in columns:
+                self._canvas.fill(colour, (x, view.top, OVERSAMPLING, view.height))
+            for y in rows:
+                self._canvas.fill(colour, (view.left, y, view.width, OVERSAMPLING))
+        width = np.full(len(self._path_mm), PATH_PX * view.pen)
+        self._shapes.lines(view, self._path_mm[:, None], width, [[PATH]] * len(width))
+
+    def _draw_patch(self, view: View, patch: Mapping[str, float]) -> None:
+        centre = view.place(patch["x_mm"], patch["y_mm"], 0.0)
+        colour = SLIPPERY if patch["scale"] < 1 else GRIPPY
+        self._shapes.disc(centre, patch["radius_mm"] * view.scale, colour)
+        if view is self._view:
+            self._shapes.label(f"µ × {patch['scale']:g}", colour, center=(centre.x, centre.y))
+
+    def _draw_scale_bar(self, view: View, length_mm: float) -> None:
+        pen, length = self._view.pen, length_mm * view.scale
+        right, bottom = view.left + view.width, view.top + view.height
+        x, y = right - EDGE_PX * pen - length, bottom - EDGE_PX * pen
+        self._canvas.fill(INK, (x, y - pen, length, 2 * pen))
+        for end in (x, x + length - 2 * pen):
+            self._canvas.fill(INK, (end, y - 4 * pen, 2 * pen, 8 * pen))
+        text = f"{length_mm:g} mm" if length_mm < 1000 else f"{length_mm / 1000:g} m"
+        self._shapes.label(text, midbottom=(x + length / 2, y - 4 * pen))
+
+    # Robots
+
+    def _draw_robots(self, view: View, scene: Scene) -> None:
+        self._draw_trails(view)
+        room = 2 * view.scale * max(robot.outline_radius_mm for robot in self._robots)
+        for draw, x_mm, y_mm, theta_rad in (
+            (self._draw_robot, scene.x_mm, scene.y_mm, scene.theta_rad),
+            (self._draw_ghost, scene.ghost_x_mm, scene.ghost_y_mm, scene.ghost_theta_rad),
+            (
+                self._draw_reference,
+                scene.reference_x_mm,
+                scene.reference_y_mm,
+                scene.reference_theta_rad,
+            ),
+        ):
+            shown = view.shows(view.px(np.stack([x_mm, y_mm], axis=-1)), room)
+            for i in np.flatnonzero(shown).tolist():
+                draw(view, view.place(x_mm[i], y_mm[i], theta_rad[i]), scene, i)
+
+    def _draw_trails(self, view: View) -> None:
+        """Thinner and paler the older; the youngest of all robots on top."""
+        if len(self._trail) < 2:
+            return
+        points = np.stack([places for _, places in self._trail])
+        age_s = self._trail[-1][0] - np.array([t_s for t_s, _ in self._trail])
+        youth = 1 - age_s / self._trail_s
+        shades = (youth[::BLOCK] * (len(self._faded) - 1)).astype(int).tolist()
+        colours = [self._faded[shade] for shade in shades]
+        self._shapes.lines(view, points, TRAIL_PX * view.pen * youth, colours)
+
+    def _draw_robot(self, view: View, body: Place, scene: Scene, i: int) -> None:
+        robot, colour, pen = self._robots[i], self._colours[i], view.pen
+        centre, half = body.at(0, -robot.outline_offset_mm), robot.axle_width_mm / 2
+        radius = view.scale * robot.outline_radius_mm
+        self._shapes.disc(centre, radius + 0.6 * pen, mixed(FLOOR, colour, 0.6))
+        self._shapes.disc(centre, radius - 0.6 * pen, mixed(FLOOR, colour, 0.25))
+        self._shapes.bar(
+            body, (2 * half * view.scale, AXLE_MM * view.scale), mixed(FLOOR, colour, 0.6)
+        )
+        ahead = robot.outline_radius_mm - robot.outline_offset_mm
+        self._shapes.fill(body.px((ahead * e, ahead * f) for e, f in NOSE), colour)
+        fork = body.at(0, -robot.castor_pivot_mm, scene.castor_rad[i])
+        castor = fork.at(0, -robot.castor_trail_mm)
+        self._draw_tyre(view, castor, CASTOR_WIDTH_MM, robot.castor_radius_mm, scene.slip_c_mm_s[i])
+        for e, angle, slip in (
+            (-half, scene.wheel_angle_l_rad[i], scene.slip_l_mm_s[i]),
+            (half, scene.wheel_angle_r_rad[i], scene.slip_r_mm_s[i]),
+        ):
+            wheel = body.at(e, 0)
+            self._draw_tyre(view, wheel, DRIVE_WHEEL_WIDTH_MM, robot.wheel_radius_mm, slip)
+            self._draw_treads(wheel, robot.wheel_radius_mm, angle)
+        if scene.touched[i]:
+            self._shapes.ring(centre, radius, 2.5 * pen, ALARM)
+        if scene.lost[i]:
+            self._shapes.cross(centre.at(0, 0, math.pi / 4), 0.9 * radius, 2.5 * pen, ALARM)
+
+    def _draw_tyre(
+        self, view: View, wheel: Place, width_mm: float, radius_mm: float, slip_mm_s: float
+    ) -> None:
+        """A wheel from above; one that slips glows."""
+        width, length = width_mm * view.scale, 2 * radius_mm * view.scale
+        strength = 0.0
+        if slip_mm_s > SLIP_SHOWN_MM_S:
+            strength = min(0.45 + 0.55 * slip_mm_s / SLIP_FULL_MM_S, 1.0)
+            glow = 4.0 * view.pen
+            self._shapes.bar(
+                wheel, (width + glow, length + glow), mixed(FLOOR, ALARM, 0.5 * strength)
+            )
+        self._shapes.bar(wheel, (width, length), mixed(TYRE, ALARM, strength))
+
+    def _draw_treads(self, wheel: Place, radius_mm: float, angle: float) -> None:
+        """The marks on the upper side of a wheel, foreshortened; rolling moves them forwards."""
+        for k in range(TREADS):
+            turn = angle + 2 * math.pi * k / TREADS
+            if math.cos(turn) > 0.3:
+                thickness = TREAD_RADII * radius_mm * math.cos(turn) * wheel.scale
+                size = DRIVE_WHEEL_WIDTH_MM * wheel.scale, thickness
+                self._shapes.bar(wheel.at(0, radius_mm * math.sin(turn)), size, TREAD)
+
+    def _draw_ghost(self, view: View, body: Place, scene: Scene, i: int) -> None:
+        """The predecessor's outline one gap ago and a tick at its front, in the follower's colour."""
+        robot, line = self._robots[i - 1], 1.3 * view.pen
+        radius, offset = robot.outline_radius_mm, robot.outline_offset_mm
+        self._shapes.ring(body.at(0, -offset), radius * view.scale, line, self._colours[i])
+        front = body.at(0, 1.1 * radius - offset)
+        self._shapes.bar(front, (line, 0.2 * radius * view.scale), self._colours[i])
+
+    def _draw_reference(self, view: View, place: Place, scene: Scene, i: int) -> None:
+        """A cross, its arms along the reference's axes."""
+        arm = ARM_RADII * self._robots[i].outline_radius_mm * view.scale
+        self._shapes.cross(place, arm, 1.2 * view.pen, INK)
+
+    def _draw_arrows(self, scene: Scene) -> None:
+        """An arrow and a name at the edge for every robot that is outside."""
+        view, pen = self._view, self._view.pen
+        places = view.px(np.stack([scene.x_mm, scene.y_mm], axis=-1))
+        size = np.array([view.width, view.height])
+        for i in np.flatnonzero(np.isfinite(places).all(axis=-1) & ~view.shows(places)).tolist():
+            right, down = places[i] - size / 2
+            x, y = np.clip(places[i], 5 * pen, size - 5 * pen).tolist()
+            arrow = Place(x, y, math.atan2(-right, -down), pen)
+            self._shapes.fill(arrow.px([(0, 0), (-7, -16), (7, -16)]), self._colours[i])
+            name = arrow.at(0, -28 - 22 * abs(math.sin(arrow.theta)))
+            middle = min(max(name.x, 36 * pen), view.width - 36 * pen)
+            self._shapes.label(f"robot_{i}", center=(middle, name.y))
+
+    # Close-up
+
+    def _close_up_view(self, i: int, scene: Scene) -> View:
+        u, robot = self._unit, self._robots[i]
+        side = OVERSAMPLING * round(CLOSE_UP_PX * u)
+        left = OVERSAMPLING * round(EDGE_PX * u)
+        top = self._view.height - side - OVERSAMPLING * round((EDGE_PX + 3 * LINE_PX) * u)
+        extent_mm = CLOSE_UP_RADII * robot.outline_radius_mm
+        back_mm = robot.outline_offset_mm
+        middle_x = float(scene.x_mm[i] + back_mm * np.sin(scene.theta_rad[i]))
+        middle_y = float(scene.y_mm[i] - back_mm * np.cos(scene.theta_rad[i]))
+        corner_mm = (middle_x - extent_mm / 2, middle_y + extent_mm / 2)
+        pen = CLOSE_UP_PEN * self._view.pen
+        return View(left, top, side, side, corner_mm, side / extent_mm, pen)
+
+    def _draw_close_up(self, scene: Scene) -> None:
+        i = self._focus
+        if i is None or not math.isfinite(scene.x_mm[i] + scene.y_mm[i] + scene.theta_rad[i]):
+            return
+        view = self._close_up_view(i, scene)
+        self._canvas.set_clip(view.rect)
+        step_mm = round_length(CLOSE_UP_RADII * self._robots[i].outline_radius_mm / 5)
+        self._draw_floor(view, step_mm)
+        self._draw_robots(view, scene)
+        self._draw_scale_bar(view, step_mm)
+        self._shapes.label(
+            f"robot_{i}", topleft=(view.left + 6 * self._view.pen, view.top + 6 * self._view.pen)
+        )
+        self._canvas.set_clip(None)
+        self._pg.draw.rect(self._canvas, mixed(FLOOR, INK, 0.5), view.rect, OVERSAMPLING)
+
+    def _draw_legend(self) -> None:
+        """What the marks mean, under the close-up."""
+        pen = self._view.pen
+        x, y = (EDGE_PX + 8) * pen, self._view.height - (EDGE_PX + 2.3 * LINE_PX) * pen
+        mark, below = Place(x, y, 0.0, 1.0), -LINE_PX * pen
+        self._shapes.cross(mark, 6 * pen, 1.3 * pen, INK)
+        self._shapes.label("reference", midleft=(x + 12 * pen, y))
+        mark = mark.at(0, below)
+        self._shapes.bar(mark, (9 * pen, 14 * pen), mixed(FLOOR, ALARM, 0.5))
+        self._shapes.bar(mark, (5 * pen, 10 * pen), ALARM)
+        self._shapes.label("slipping wheel", midleft=(x + 12 * pen, mark.y))
+        if len(self._robots) > 1:
+            mark = mark.at(0, below)
+            self._shapes.ring(mark, 6 * pen, 1.5 * pen, self._colours[self._focus or 1])
+            self._shapes.label("predecessor one gap ago", midleft=(x + 12 * pen, mark.y))
+
+    # Text
+
+    def _write(self, scene: Scene) -> None:
+        u = self._text_unit
+        top, bottom = (EDGE_PX + 1.7 * LINE_PX) * u, self._size_px[1] - EDGE_PX * u
+        if self._focus is not None:
+            bottom -= (CLOSE_UP_PX + 4 * LINE_PX) * u
+        rows = min(len(self._robots), max(int((bottom - top) / (LINE_PX * u)), 1))
+        plate = self._pg.Surface((TABLE_PX * u, top + rows * LINE_PX * u), self._pg.SRCALPHA)
+        plate.fill((*FLOOR, PLATE_ALPHA))
+        self._picture.blit(plate, (0, 0))
+        time = self._time_font.render(f"t = {scene.t_s:.2f} s", True, INK)
+        self._picture.blit(time, (EDGE_PX * u, EDGE_PX * u))
+        for i in range(rows):
+            self._write_robot(scene, i, top + i * LINE_PX * u)
+
+    def _write_robot(self, scene: Scene, i: int, y: float) -> None:
+        """One line: colour, name, position error, time-gap error, what has happened."""
+        u = self._text_unit
+        x = EDGE_PX * u
+        self._pg.draw.aacircle(self._picture, self._colours[i], (x + 5 * u, y + 6 * u), 5 * u)
+        gap = f"{scene.time_gap_error_s[i]:+.3f} s" if i > 0 else ""
+        flags = [name for name in ("lost", "touched") if getattr(scene, name)[i]]
+        texts = (f"robot_{i}", _length_text(scene.position_error_mm[i]), gap, ", ".join(flags))
+        sides = ("topleft", "topright", "topright", "topleft")
+        for text, column, side in zip(texts, COLUMNS_PX, sides, strict=True):
+            if not text:
+                continue
+            image = self._font.render(text, True, ALARM if column == COLUMNS_PX[-1] else INK)
+            self._picture.blit(image, image.get_rect(**{side: (x + column * u, y)}))
+
+
+def round_length(least: float) -> float:
+    """The smallest of 1, 2, 5, 10, 20 … that is at least this."""
+    power = 10.0 ** math.floor(math.log10(least))
+    return next(digit * power for digit in (1, 2, 5, 10) if digit * power >= least)
+
+
+def _grid_lines(view: View, step_mm: float, phase: float) -> tuple[list[int], list[int]]:
+    """Where the lines x and y = (k + phase)·step lie on the canvas, at whole px of the picture."""
+    x_mm, y_mm = view.corner_mm
+    columns = np.arange(math.floor(x_mm / step_mm), (x_mm + view.width / view.scale) / step_mm)
+    rows = np.arange(
+        math.floor(y_mm / step_mm), (y_mm - view.height / view.scale) / step_mm - 1, -1
+    )
+    x = view.left + ((columns + phase) * step_mm - x_mm) * view.scale
+    y = view.top + (y_mm - (rows + phase) * step_mm) * view.scale
+    whole = ((axis / OVERSAMPLING).round().astype(int) * OVERSAMPLING for axis in (x, y))
+    columns_px, rows_px = (axis.tolist() for axis in whole)
+    return columns_px, rows_px
+
+
+def _length_text(length_mm: float) -> str:
+    return f"{length_mm:.1f} mm" if length_mm < 1000 else f"{length_mm / 1000:.2f} m"
+
+
+def _pygame() -> Any:
+    os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
+    try:
+        import pygame
+    except ImportError as error:
+        raise ImportError("rendering needs pygame: pip install 'tlf-env[view]'") from error
+    pygame.font.init()
+    return pygame

@@ -1,0 +1,94 @@
+"""What one frame shows of a formation."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+
+from tlf_env.engine.formation import Formation
+from tlf_env.onboard.observer import Reference
+from tlf_env.physics.state import Contact, Motion
+from tlf_env.task.info import Info, State
+
+STILL_MM = 1e-3  # who went less has no direction
+
+
+class Scene(NamedTuple):
+    """Everything that one frame shows. A row of each array is a robot; units mm, rad, s.
+
+    Poses are those of the axle midpoint c; headings counter-clockwise from +y.
+    """
+
+    t_s: float
+    x_mm: np.ndarray
+    y_mm: np.ndarray
+    theta_rad: np.ndarray
+    castor_rad: np.ndarray  # fork angle relative to the body
+    wheel_angle_l_rad: np.ndarray
+    wheel_angle_r_rad: np.ndarray
+    reference_x_mm: np.ndarray  # each robot's own reference
+    reference_y_mm: np.ndarray
+    reference_theta_rad: np.ndarray
+    ghost_x_mm: np.ndarray  # the predecessor one gap ago; NaN where there is none
+    ghost_y_mm: np.ndarray
+    ghost_theta_rad: np.ndarray
+    slip_l_mm_s: np.ndarray
+    slip_r_mm_s: np.ndarray
+    slip_c_mm_s: np.ndarray
+    position_error_mm: np.ndarray
+    time_gap_error_s: np.ndarray
+    lost: np.ndarray  # bool
+    touched: np.ndarray  # bool
+
+
+def scene_of(formation: Formation) -> Scene:
+    """The scene of a formation as it is now: the truth, in fresh arrays."""
+    a = formation.arrays
+    motion = dict(zip(Motion._fields, a.motions[:, :, 0].copy(), strict=True))
+    contact = dict(zip(Contact._fields, a.contacts[:, :, 0].copy(), strict=True))
+    state = dict(zip(State._fields, formation.state().T, strict=True))
+    slot = formation.step_count % a.references.shape[1]
+    reference = dict(zip(Reference._fields, a.references[:, slot, :, 0].copy(), strict=True))
+    info = dict(zip(Info._fields, a.infos[0].T.copy(), strict=True))
+    ghost_x_mm, ghost_y_mm, ghost_theta_rad = _ghosts(formation, motion["theta"])
+    return Scene(
+        t_s=formation.time_s,
+        x_mm=state["x_mm"],
+        y_mm=state["y_mm"],
+        theta_rad=motion["theta"],
+        castor_rad=state["castor_rad"],
+        wheel_angle_l_rad=motion["angle_l"],
+        wheel_angle_r_rad=motion["angle_r"],
+        reference_x_mm=reference["x"],
+        reference_y_mm=reference["y"],
+        reference_theta_rad=reference["theta"],
+        ghost_x_mm=ghost_x_mm,
+        ghost_y_mm=ghost_y_mm,
+        ghost_theta_rad=ghost_theta_rad,
+        slip_l_mm_s=contact["slip_l"],
+        slip_r_mm_s=contact["slip_r"],
+        slip_c_mm_s=contact["slip_c"],
+        position_error_mm=info["position_error_mm"],
+        time_gap_error_s=info["time_gap_error_s"],
+        lost=a.lost[0].copy(),
+        touched=a.touched[0].copy(),
+    )
+
+
+def _ghosts(formation: Formation, theta: np.ndarray) -> np.ndarray:
+    """Pose of every robot's predecessor one gap ago, ``(3, robot)``.
+
+    Its heading is the direction it went; where it stood still, the one it has now.
+    """
+    paths = formation.arrays.paths[:, :, :-1, 0]  # of the predecessors
+    ghosts = np.full((3, len(theta)), np.nan)
+    step = formation.step_count - formation.scenario.gap_steps
+    if step < 0 or len(theta) == 1:
+        return ghosts
+    slots = paths.shape[1]
+    went_x, went_y = paths[:, (step + 1) % slots] - paths[:, max(step - 1, 0) % slots]
+    ghosts[:2, 1:] = paths[:, step % slots]
+    moved = np.hypot(went_x, went_y) > STILL_MM
+    ghosts[2, 1:] = np.where(moved, np.arctan2(-went_x, went_y), theta[:-1])
+    return ghosts

@@ -1,0 +1,80 @@
+"""What an environment reports of a robot after a step beside its observation: ``info`` and ``state``."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+
+class Info(NamedTuple):
+    """What ``info`` tells of one robot after a step; see :data:`INFO_MEANINGS`."""
+
+    position_error_mm: float
+    formation_error_mm: float
+    heading_error_rad: float
+    time_gap_error_s: float
+    slip_mm_s: float
+    torque_l_Nmm: float
+    torque_r_Nmm: float
+    torque_rms_Nmm: float
+    energy_mJ: float
+    slid_mm: float
+    saturation_fraction: float
+    innovation_nis: float
+    x_mm: float
+    y_mm: float
+    theta_rad: float
+    reference_x_mm: float
+    reference_y_mm: float
+    reference_theta_rad: float
+    clipped: float
+
+
+RUNNING, LOST, TOUCHED, OTHER_ROBOT, HORIZON = range(5)
+END_REASONS = ("", "lost", "touched", "other_robot", "horizon")
+
+INFO_MEANINGS = {
+    "position_error_mm": "true position of c to the robot's own reference (leader: the path)",
+    "formation_error_mm": "true position to ref(t − i·gap), at rest at ref(0) before",
+    "heading_error_rad": "reference's heading minus the true one, within ±π",
+    "time_gap_error_s": "how much later than one gap ago the predecessor passed here; 0 for the "
+    "leader and before one gap",
+    "slip_mm_s": "largest slip speed of a drive wheel in the step",
+    "torque_l_Nmm": "torque delivered to the left wheel, mean over the step",
+    "torque_r_Nmm": "the same, right",
+    "torque_rms_Nmm": "root mean square over the step and both wheels",
+    "energy_mJ": "work that the motors put in during the step; braking gives none back",
+    "slid_mm": "mean way that the drive wheels slipped in the step",
+    "saturation_fraction": "share of the substeps with a torque asked for at its limit",
+    "innovation_nis": "normalised innovation squared of the EKF, mean over the step",
+    "x_mm": "true position of c",
+    "y_mm": "true position of c",
+    "theta_rad": "true heading, not wrapped",
+    "reference_x_mm": "the robot's own reference",
+    "reference_y_mm": "the robot's own reference",
+    "reference_theta_rad": "its heading",
+    "clipped": "actions of this robot outside [−1, 1] so far in the episode",
+}
+OTHER_INFO = {
+    "reward": "the unweighted reward terms by name",
+    "disturbance": "the value of every channel that acted, by its path",
+    "lost": "whether the robot was lost at any time so far",
+    "touched": "whether it touched another at any time so far",
+    "end": "in the last step: lost, touched, other_robot or horizon",
+}
+
+
+class State(NamedTuple):
+    """One robot's true state, for critics that may see it: c, castor, twist, wheels, reference."""
+
+    x_mm: float
+    y_mm: float
+    sin_theta: float
+    cos_theta: float
+    castor_rad: float
+    forward_mm_s: float
+    right_mm_s: float
+    yaw_rad_s: float
+    omega_l_rad_s: float
+    omega_r_rad_s: float
+    reference_x_mm: float
+    reference_y_mm: float
