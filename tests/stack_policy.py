@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tlf_env.numerics.compiled import driver
+from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.estimator import (
     Ekf,
     Estimate,
@@ -25,12 +26,10 @@ from tlf_env.onboard.estimator import (
 )
 from tlf_env.onboard.observer import Message, observed_reference, observer_rates, smoothing
 from tlf_env.onboard.tracking import (
-    CONTROLLERS,
-    GAIN_PRESETS,
+    Controller,
     Gains,
     body_errors,
     gains_row,
-    tracking_gains,
     tracking_twist,
 )
 from tlf_env.onboard.wheel_loop import (
@@ -207,9 +206,10 @@ class StackPolicy:
                 "StackPolicy gives the torques of every physics period: control_period_s "
                 f"{scenario.control_period_s} must be physics_period_s {scenario.physics_period_s}"
             )
-        if gains in CONTROLLERS and gains not in GAIN_PRESETS:
+        law = controller(gains)
+        if law != Controller(gains=law.gains):
             raise ValueError(
-                f"StackPolicy has the paper's law and filter, gains {', '.join(GAIN_PRESETS)}; "
+                "StackPolicy has the paper's law and filter, gains consistent, printed; "
                 f"{gains!r} needs limits and an estimate of the slip"
             )
         robots = scenario.robot_models
@@ -221,7 +221,7 @@ class StackPolicy:
             bodies=body_array(list(robots)),
             ekf=ekf_constants(scenario.ekf),
             loop=digital_wheel_loop(wheel_loop, scenario.control_period_s),
-            gains=gains_row(tracking_gains(gains)),
+            gains=gains_row(law.gains),
             observer_gain=observer.gain_per_s,
             smoothing=observer.smoothing_s,
             period=scenario.control_period_s,

@@ -11,12 +11,12 @@ import tlf_env
 from baselines import ReferencePolicy
 from baselines.runs.run import run_policy, run_seeds
 from tlf_env import BatchPlant
-from tlf_env.common.presets import preset_names, presets_folder
+from tlf_env.common.presets import preset_names
 from tlf_env.engine.formation import Formation
 from tlf_env.task.info import END_REASONS
 from tlf_env.task.scenario import load_scenario
 
-DISTURBANCES = preset_names(presets_folder() / "disturbances")
+DISTURBANCES = preset_names("disturbance")
 POLICY = ReferencePolicy()
 SHORT: dict[str, Any] = {"time_gap_s": 1.0, "horizon_s": 4.0, "end_on": ()}
 # Neighbours a few millimetres apart, on a floor that slips: half of the seeds touch at once.

@@ -306,7 +306,7 @@ def test_seeds_of_another_form_are_told(text):
         ("--level -1", "level"),
         ("--horizon-s 0.03", "horizon_s"),
         ("--processes -1", "processes"),
-        ("--plan no_such", "neither one of board, unseen nor a .yaml file"),
+        ("--plan no_such", "not one of board, unseen, nor a .yaml file"),
         ("--plan no_such.yaml", "no_such.yaml"),
         ("--plan trusting.yaml", "'trust'"),
         ("--plan nested.yaml", "seeds must be a text, a number or a list"),

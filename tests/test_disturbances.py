@@ -161,7 +161,7 @@ def test_a_payload_without_mass_changes_nothing():
     assert (found.motion == nominal().motion).all()
 
 
-@pytest.mark.parametrize("name", preset_names(presets_folder() / "disturbances"))
+@pytest.mark.parametrize("name", preset_names("disturbance"))
 def test_every_preset_at_level_0_is_bitwise_nominal(name):
     found = Run(make(name, disturbance_level=0.0))
     assert (found.motion == nominal().motion).all()
@@ -983,7 +983,7 @@ PRESETS = {
 
 
 def test_presets_are_those_of_the_folder():
-    assert sorted(PRESETS) == preset_names(presets_folder() / "disturbances")
+    assert sorted(PRESETS) == preset_names("disturbance")
 
 
 @pytest.mark.parametrize("name", PRESETS)
@@ -1003,7 +1003,7 @@ def test_presets_hold_their_numbers_and_nothing_else(name):
 
 @pytest.mark.parametrize("name", ["payload", "radio", "actuator"])
 def test_chosen_numbers_name_their_source(name):
-    text = (presets_folder() / "disturbances" / f"{name}.yaml").read_text(encoding="utf-8")
+    text = (presets_folder("disturbance") / f"{name}.yaml").read_text(encoding="utf-8")
     assert "Source" in text
     assert yaml.safe_load(text)
 

@@ -12,12 +12,12 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import tlf_env
+from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.tracking import (
     body_errors,
     complementary_twist,
     gains_row,
     nominal_twist,
-    tracking_gains,
     tracking_twist,
 )
 from tlf_env.physics.kinematics import follow_wheels
@@ -96,7 +96,7 @@ def law_of(kind, e, u_star, gains):
 
 @presets
 def test_nominal_law_makes_lyapunov_rate_that_of_proposition_1(preset):
-    gains = gains_row(tracking_gains(preset))
+    gains = gains_row(controller(preset).gains)
     for *e, u_1, u_2 in random_errors():
         u = law_of(nominal_twist, e, (u_1, u_2), gains)
         rate = lyapunov_rate(e, error_rates(e, u, (u_1, u_2)), gains.k_3)
@@ -108,7 +108,7 @@ def test_nominal_law_makes_lyapunov_rate_that_of_proposition_1(preset):
 
 @presets
 def test_whole_law_without_slip_never_raises_the_lyapunov_function(preset):
-    gains = gains_row(tracking_gains(preset))
+    gains = gains_row(controller(preset).gains)
     rows = np.vstack([random_errors(), layer_errors(gains, True), layer_errors(gains, False)])
     for *e, u_1, u_2 in rows:
         u = law_of(tracking_twist, e, (u_1, u_2), gains)
@@ -118,13 +118,13 @@ def test_whole_law_without_slip_never_raises_the_lyapunov_function(preset):
 
 @presets
 def test_on_the_reference_the_law_commands_the_references_twist(preset):
-    gains = gains_row(tracking_gains(preset))
+    gains = gains_row(controller(preset).gains)
     assert law_of(tracking_twist, (0.0, 0.0, 0.0), (321.0, -0.7), gains) == (321.0, -0.7)
 
 
 @presets
 def test_law_has_the_period_of_the_heading(preset):
-    gains = gains_row(tracking_gains(preset))
+    gains = gains_row(controller(preset).gains)
     for *e, u_1, u_2 in random_errors(50):
         here = law_of(tracking_twist, e, (u_1, u_2), gains)
         turned = law_of(tracking_twist, (e[0], e[1], e[2] + 2 * math.pi), (u_1, u_2), gains)
@@ -132,7 +132,7 @@ def test_law_has_the_period_of_the_heading(preset):
 
 
 def test_presets_differ_in_the_heading_damping_alone():
-    consistent, printed = tracking_gains("consistent"), tracking_gains("printed")
+    consistent, printed = controller("consistent").gains, controller("printed").gains
     assert printed.k_2_mm2_s == 0.83
     assert consistent.k_2_mm2_s / consistent.k_3_mm2 == pytest.approx(0.83, rel=1e-12)
     for gains in (consistent, printed):
@@ -146,7 +146,7 @@ def test_presets_differ_in_the_heading_damping_alone():
 @untimed
 @given(st.floats(-3000, 3000), st.floats(-1, 1))
 def test_complementary_law_opposes_lambda_within_eta(e_1, sin_e3):
-    gains = gains_row(tracking_gains("consistent"))
+    gains = gains_row(controller("consistent").gains)
     rho = complementary_twist(e_1, sin_e3, gains)
     for r, lam in zip(rho, (-e_1, -gains.k_3 * sin_e3), strict=True):
         assert abs(r) <= gains.eta
@@ -156,18 +156,18 @@ def test_complementary_law_opposes_lambda_within_eta(e_1, sin_e3):
 @untimed
 @given(st.floats(-3000, 3000), st.floats(-1, 1))
 def test_complementary_law_is_odd(e_1, sin_e3):
-    gains = gains_row(tracking_gains("consistent"))
+    gains = gains_row(controller("consistent").gains)
     there = complementary_twist(e_1, sin_e3, gains)
     back = complementary_twist(-e_1, -sin_e3, gains)
     assert back == (-there[0], -there[1])
 
 
 def test_complementary_law_is_zero_at_zero():
-    assert complementary_twist(0.0, 0.0, gains_row(tracking_gains("consistent"))) == (0.0, 0.0)
+    assert complementary_twist(0.0, 0.0, gains_row(controller("consistent").gains)) == (0.0, 0.0)
 
 
 def test_complementary_law_is_eta_outside_its_layer_and_linear_inside():
-    gains = gains_row(tracking_gains("consistent"))
+    gains = gains_row(controller("consistent").gains)
     for *e, _, _ in layer_errors(gains, inside=False):
         lam = np.array([-e[0], -gains.k_3 * math.sin(e[2])])
         rho = complementary_twist(e[0], math.sin(e[2]), gains)
@@ -181,7 +181,7 @@ def test_complementary_law_is_eta_outside_its_layer_and_linear_inside():
 @pytest.mark.parametrize("share", [0.0, 0.2, 0.5, 0.9, 1.0])
 def test_complementary_law_jumps_at_the_edge_unless_one_component_is_zero(share):
     """At η‖λ‖₁ = ε each component goes from η|λᵢ|/‖λ‖₁ to η."""
-    gains = gains_row(tracking_gains("consistent"))
+    gains = gains_row(controller("consistent").gains)
     shares = np.array([share, 1 - share])
 
     def magnitudes(size: float) -> np.ndarray:
@@ -195,7 +195,7 @@ def test_complementary_law_jumps_at_the_edge_unless_one_component_is_zero(share)
 @presets
 def test_slip_within_eta_is_cancelled_outside_the_layer(preset):
     """Eq. (24), with the nominal part kept: V̇ ≤ −k₁e₁² − k₂ sin²e₃ + (β − η)‖λ‖₁."""
-    gains = gains_row(tracking_gains(preset))
+    gains = gains_row(controller(preset).gains)
     rng = np.random.default_rng(3)
     for *e, u_1, u_2 in layer_errors(gains, inside=False):
         delta = rng.uniform(-gains.eta, gains.eta, 2)
@@ -210,7 +210,7 @@ def test_slip_within_eta_is_cancelled_outside_the_layer(preset):
 @presets
 def test_slip_within_eta_adds_at_most_half_epsilon_inside_the_layer(preset):
     """Eq. (25) with ‖λ‖₂² in place of its ‖λ‖₁²: ε/2, which is approached, and not ε/4."""
-    gains = gains_row(tracking_gains(preset))
+    gains = gains_row(controller(preset).gains)
     largest = 0.0
     errors = layer_errors(gains, inside=True)
     corner = 0.5 * (1 - 1e-9) * gains.epsilon / gains.eta
@@ -306,7 +306,7 @@ def test_wheel_speed_command_is_in_units_of_25_rad_s():
 @pytest.mark.parametrize("start", [(100.0, -200.0, -0.5), (-80.0, 150.0, 2.5)])
 def test_kinematic_closed_loop_follows_the_continuous_solution(preset, start):
     """Law and kinematic plant at 1 ms against an adaptive solution of (17) with (19) and (21)."""
-    gains = gains_row(tracking_gains(preset))
+    gains = gains_row(controller(preset).gains)
     u_star, duration, dt = (300.0, 0.4), 20.0, 0.001
     k_1, k_2, k_3, eta, epsilon = gains
 

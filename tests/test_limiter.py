@@ -14,6 +14,7 @@ import tlf_env
 from baselines import ReferencePolicy
 from tlf_env.engine.formation import Formation
 from tlf_env.envs.single import FormationEnv
+from tlf_env.onboard.controllers import controller, controller_names
 from tlf_env.onboard.estimator import odometry
 from tlf_env.onboard.limiter import (
     TwistLimits,
@@ -25,10 +26,8 @@ from tlf_env.onboard.limiter import (
     within,
 )
 from tlf_env.onboard.tracking import (
-    CONTROLLERS,
     Controller,
     TrackingGains,
-    controller,
     controller_row,
     gains_row,
     tracking_twist,
@@ -45,7 +44,7 @@ SCALES = np.array([entry.scale for entry in tracking_entries(PREVIEW_S).values()
 NONE = limits_row(TwistLimits(), PERIOD_S)
 TUNED = controller("tuned").limits
 ALL = limits_row(TUNED, PERIOD_S)
-PAPERS = [name for name in CONTROLLERS if name != "tuned"]
+PAPERS = [name for name in controller_names() if name != "tuned"]
 
 speeds = st.floats(-2000, 2000)
 yaws = st.floats(-20, 20)

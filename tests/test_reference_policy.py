@@ -10,7 +10,8 @@ from helpers import reference_actions, stacked
 
 import tlf_env
 from baselines import ReferencePolicy
-from tlf_env.onboard.tracking import TrackingGains, gains_row, tracking_gains, tracking_twist
+from tlf_env.onboard.controllers import controller
+from tlf_env.onboard.tracking import TrackingGains, gains_row, tracking_twist
 from tlf_env.task.observation import Tracking, tracking_entries
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
@@ -29,7 +30,7 @@ def batch(rows: int = 64, entries: int = ENTRIES, seed: int = 0) -> np.ndarray:
 @presets
 def test_action_is_the_law_at_the_formations_estimates(preset):
     env = tlf_env.parallel_env("infinity", end_on=())
-    policy, gains = ReferencePolicy(preset), gains_row(tracking_gains(preset))
+    policy, gains = ReferencePolicy(preset), gains_row(controller(preset).gains)
     observations, infos = env.reset(seed=1)
     compared = 0
     for _ in range(800):

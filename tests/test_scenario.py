@@ -46,12 +46,12 @@ def written(tmp_path, text: str, name: str = "mine.yaml"):
 
 def test_presets_are_there():
     assert {"infinity", "flower"} <= set(preset_names())
-    disturbances = preset_names(presets_folder() / "disturbances")
+    disturbances = preset_names("disturbance")
     assert {"nominal", "none"} <= set(disturbances)
 
 
 @pytest.mark.parametrize("name", preset_names())
-@pytest.mark.parametrize("disturbance", preset_names(presets_folder() / "disturbances"))
+@pytest.mark.parametrize("disturbance", preset_names("disturbance"))
 def test_presets_load(name, disturbance):
     scenario = load_scenario(name, disturbance=disturbance)
     assert scenario.name == name

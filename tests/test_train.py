@@ -51,7 +51,7 @@ ALGORITHMS = {
 }
 
 
-@pytest.mark.parametrize("path", sorted((presets_folder() / "train").glob("*.yaml")), ids=str)
+@pytest.mark.parametrize("path", sorted((presets_folder("training")).glob("*.yaml")), ids=str)
 def test_shipped_configs_are_valid(path: Path):
     config = load_config(path)
     tasks, shares = config.mixture()
@@ -72,7 +72,7 @@ def test_shipped_configs_are_valid(path: Path):
         ),
         ({"disturbances": {"storm": 1}}, "disturbance 'storm' is not one of"),
         ({"disturbances": {"slip": 0}}, "at least one share must be above 0"),
-        ({"tasks": {"square": {}}}, "scenario 'square' is neither a preset"),
+        ({"tasks": {"square": {}}}, "scenario 'square' is not one of"),
         ({"tasks": {"infinity": {"speed": 1}}}, "speed: unknown key"),
         ({"network": {"lstm": 8}}, "network.lstm is for RecurrentPPO and needed there; got 8"),
         ({"algorithm": "RecurrentPPO"}, "network.lstm is for RecurrentPPO and needed there"),
@@ -88,8 +88,8 @@ def test_a_wrong_config_is_told_in_one_line(changes: dict, said: str):
 
 
 def test_presets_have_names():
-    assert load_config("quick") == load_config(presets_folder() / "train" / "quick.yaml")
-    with pytest.raises(ValueError, match="training 'quickly' is neither direct, quick"):
+    assert load_config("quick") == load_config(presets_folder("training") / "quick.yaml")
+    with pytest.raises(ValueError, match="training 'quickly' is not one of direct, quick"):
         load_config("quickly")
 
 

@@ -6,6 +6,7 @@ import signal
 import subprocess
 import sys
 import time
+from pathlib import Path
 
 import pytest
 import yaml
@@ -13,7 +14,6 @@ import yaml
 pytest.importorskip("optuna")
 
 from baselines.cli import main
-from baselines.policies.controllers import load_controller
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.registry import enter
 from baselines.tuning import tune
@@ -28,11 +28,11 @@ from baselines.tuning.tune import (
     load_tune,
     run_tune,
 )
-from tlf_env.common.presets import presets_folder
-from tlf_env.onboard.tracking import CONTROLLERS, controller
+from tlf_env.onboard.controllers import controller, load_controller
 from tlf_env.task.scenario import load_scenario
 
 # A start of its own: the preset may change.
+ROOT = Path(__file__).resolve().parents[1]
 GAINS = {
     "k_1_per_s": 0.55,
     "k_2_mm2_s": 6.4 * 1.76e4,
@@ -394,7 +394,7 @@ def test_bad_input_is_one_line_and_writes_nothing(change, said, tmp_path, monkey
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("no_such", "'no_such' is neither tuned nor a .yaml file"),
+        ("no_such", "'no_such' is not one of tuned, nor a .yaml file"),
         ("no_such.yaml", "cannot read no_such.yaml"),
         ("list.yaml", "must hold a mapping"),
         ("search.yaml --trials 0", "trials: Input should be greater than or equal to 1, got 0"),
@@ -459,8 +459,7 @@ def test_the_start_is_the_first_trial(tmp_path):
 
 
 def test_the_committed_result_is_of_the_committed_search():
-    folder = presets_folder() / "tune"
-    result = load_controller(folder / "tuned-result.yaml")
+    result = load_controller(ROOT / "docs" / "tuning" / "tuned-result.yaml")
     search = load_tune("tuned").model_dump(mode="json")
     assert set(result.found["search"]["search"]) == set(search["search"])
     assert result.found["search"]["seeds"] == search["seeds"]
@@ -468,7 +467,7 @@ def test_the_committed_result_is_of_the_committed_search():
 
 
 def test_a_search_may_say_its_start_in_numbers():
-    numbers = CONTROLLERS["tuned"].model_dump()
+    numbers = controller("tuned").model_dump()
     assert config(start=numbers) == config(start="tuned")
 
 

@@ -25,7 +25,7 @@ from baselines.policies.registry import enter
 from baselines.runs.jobs import claim, spread
 from baselines.runs.run import Record, run_policy, run_seeds, versions
 from tlf_env.common.files import atomic
-from tlf_env.common.presets import preset_names, presets_folder, read_yaml
+from tlf_env.common.presets import preset_names, read_preset_or_file
 from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import Policy
@@ -168,13 +168,7 @@ def read_plan(name: str, fields: Collection[str]) -> dict[str, Any]:
     ValueError
         for a plan that there is not, and for another field or a value of no use.
     """
-    folder = presets_folder() / "plans"
-    is_file = Path(name).suffix in (".yaml", ".yml")
-    if not is_file and name not in preset_names(folder):
-        raise ValueError(
-            f"plan {name!r} is neither one of {', '.join(preset_names(folder))} nor a .yaml file"
-        )
-    found = read_yaml(Path(name) if is_file else folder / f"{name}.yaml")
+    found = read_preset_or_file("plan", name)
     options = {}
     for field, value in found.items():
         if field not in fields:
@@ -187,7 +181,7 @@ def read_plan(name: str, fields: Collection[str]) -> dict[str, Any]:
 
 def disturbance_presets() -> list[str]:
     """Names of all disturbance presets."""
-    return preset_names(presets_folder() / "disturbances")
+    return preset_names("disturbance")
 
 
 def run_cell(plan: Plan, cell: Cell) -> dict[str, Any]:

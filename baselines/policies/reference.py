@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from baselines.policies.controllers import SUFFIXES, load_controller
+from tlf_env.common.presets import is_file_name
 from tlf_env.numerics.compiled import driver
+from tlf_env.onboard.controllers import load_controller
 from tlf_env.onboard.tracking import (
     Controller,
     ControllerRow,
     TrackingGains,
-    controller,
     controller_row,
 )
 from tlf_env.task.actions import ACTION_SIZE, reference_action
@@ -60,12 +60,10 @@ class ReferencePolicy:
     ) -> None:
         self.files: tuple[Path, ...] = ()
         asked: dict[str, Any] = {}
-        if isinstance(gains, str) and gains.endswith(SUFFIXES):
+        if isinstance(gains, str):
             file = load_controller(gains)
             self.controller, asked = file.controller, file.scenario_overrides
-            self.files = (Path(gains),)
-        elif isinstance(gains, str):
-            self.controller = controller(gains)
+            self.files = (Path(gains),) if is_file_name(gains) else ()
         elif isinstance(gains, TrackingGains):
             self.controller = Controller(gains=gains)
         else:

@@ -12,8 +12,8 @@ from baselines.policies.card import WEIGHTS
 from baselines.policies.classical import FeedbackLinearisation, PurePursuit
 from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.policies.reference import ReferencePolicy
+from tlf_env.onboard.controllers import controller_names
 from tlf_env.onboard.parts import Policy, load_part, make_part
-from tlf_env.onboard.tracking import CONTROLLERS
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import Scenario, load_scenario
@@ -45,7 +45,7 @@ class Entry(NamedTuple):
 
 def policy_names() -> list[str]:
     """The names of the policies that are not learned; they need no file."""
-    return [*(f"reference:{gains}" for gains in CONTROLLERS), *CLASSICAL]
+    return [*(f"reference:{gains}" for gains in controller_names()), *CLASSICAL]
 
 
 def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy:

@@ -10,7 +10,7 @@ from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Positive
-from tlf_env.common.presets import preset_names, presets_folder, read_yaml
+from tlf_env.common.presets import read_preset_or_file
 from tlf_env.task.scenario import Scenario, load_scenario
 
 # Seeds of the benchmark's tables start at 20000: neither training nor choosing may see them.
@@ -156,14 +156,7 @@ def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> Tra
     if isinstance(source, Mapping):
         data = dict(source)
     else:
-        folder = presets_folder() / "train"
-        names = preset_names(folder)
-        path = folder / f"{source}.yaml" if str(source) in names else Path(source)
-        if path.suffix not in (".yaml", ".yml"):
-            raise ValueError(
-                f"training {str(source)!r} is neither {', '.join(names)} nor a .yaml file"
-            )
-        data = read_yaml(path)
+        data = read_preset_or_file("training", source)
     data |= {name: value for name, value in overrides.items() if value is not None}
     try:
         return TrainConfig.model_validate(data)

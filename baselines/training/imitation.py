@@ -11,7 +11,7 @@ from baselines.policies.reference import ReferencePolicy
 from baselines.policies.registry import fits
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import ImitationConfig, TrainConfig
-from tlf_env.onboard.tracking import controller
+from tlf_env.onboard.controllers import controller
 
 BATCH = 2048
 

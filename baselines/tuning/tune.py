@@ -34,17 +34,17 @@ from baselines.benchmark.bench import (
     scenario_hash,
     with_value,
 )
-from baselines.policies.controllers import ControllerFile
 from baselines.policies.reference import ReferencePolicy
 from baselines.runs.jobs import alone_in, claim, spread
 from baselines.runs.run import Record, run_seeds, versions
 from tlf_env.common.errors import one_line
 from tlf_env.common.files import atomic
 from tlf_env.common.models import Frozen, NonNegative, Positive
-from tlf_env.common.presets import preset_names, presets_folder, read_yaml
+from tlf_env.common.presets import read_preset_or_file
 from tlf_env.numerics.compiled import sources_digest
+from tlf_env.onboard.controllers import ControllerFile, controller
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
-from tlf_env.onboard.tracking import Controller, controller, controller_row
+from tlf_env.onboard.tracking import Controller, controller_row
 from tlf_env.task.metrics import ERROR_CAP_MM, FORMATION_SETTLE_S, LOST_RMS_MM
 from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -298,16 +298,10 @@ def load_tune(source: str | Path, *, trials: int | None = None) -> TuneConfig:
     ValueError
         in one line that names the value and what is allowed.
     """
-    folder = presets_folder() / "tune"
-    names = [name for name in preset_names(folder) if not name.endswith("-result")]
-    if str(source) in names:
-        source = folder / f"{source}.yaml"
-    path = Path(source)
-    if path.suffix not in (".yaml", ".yml"):
-        raise ValueError(f"search {str(source)!r} is neither {', '.join(names)} nor a .yaml file")
+    found = read_preset_or_file("search", source)
     try:
         given = {} if trials is None else {"trials": trials}
-        return TuneConfig.model_validate(read_yaml(path) | given)
+        return TuneConfig.model_validate(found | given)
     except ValidationError as error:
         raise ValueError(one_line(error)) from error
 

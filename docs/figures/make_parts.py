@@ -13,7 +13,7 @@ from make_board import DOCS, with_part, write_text
 
 from baselines import ReferencePolicy
 from baselines.runs.run import run_seeds
-from tlf_env.onboard.tracking import controller
+from tlf_env.onboard.controllers import controller
 from tlf_env.task.scenario import load_scenario
 
 HORIZON_S = 60.0

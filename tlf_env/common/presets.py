@@ -8,17 +8,15 @@ from typing import Any
 import yaml
 
 PACKAGE = Path(__file__).resolve().parent.parent
-
-
-def presets_folder() -> Path:
-    """Where the presets lie: inside the installed package, or at the top of a source checkout."""
-    installed = PACKAGE / "configs"
-    return installed if installed.is_dir() else PACKAGE.parent / "configs"
-
-
-def preset_names(folder: Path | None = None) -> list[str]:
-    """Names of the presets in a folder of configs, by default the scenarios."""
-    return sorted(path.stem for path in (folder or presets_folder()).glob("*.yaml"))
+KINDS = {
+    "scenario": "",
+    "disturbance": "disturbances",
+    "controller": "controllers",
+    "plan": "plans",
+    "training": "train",
+    "search": "tune",
+}  # what a preset can be, and its folder inside the presets' folder
+SUFFIXES = (".yaml", ".yml")
 
 
 class _RepeatedKeyError(ValueError):
@@ -62,3 +60,47 @@ def read_yaml(path: Path) -> dict[str, Any]:
     if not isinstance(data, dict):
         raise ValueError(f"{path} must hold a mapping, got {type(data).__name__}")
     return data
+
+
+def presets_folder(kind: str = "scenario") -> Path:
+    """The folder of the presets of a kind, in the installed package or in a source checkout."""
+    installed = PACKAGE / "configs"
+    root = installed if installed.is_dir() else PACKAGE.parent / "configs"
+    return root / KINDS[kind]
+
+
+def preset_names(kind: str = "scenario") -> list[str]:
+    """Names of the presets of a kind, sorted."""
+    return sorted(path.stem for path in presets_folder(kind).glob("*.yaml"))
+
+
+def is_file_name(source: str | Path) -> bool:
+    """Whether a source names a YAML file rather than a preset."""
+    return Path(source).suffix in SUFFIXES
+
+
+def read_preset_or_file(kind: str, source: str | Path, others: str = "") -> dict[str, Any]:
+    """The mapping of a preset, by its name, or of a YAML file, by its path.
+
+    Parameters
+    ----------
+    kind
+        One of :data:`KINDS`.
+    source
+        A preset's name, or a path that ends in ``.yaml`` or ``.yml``.
+    others
+        What else is allowed, for the error.
+
+    Raises
+    ------
+    ValueError
+        in one line, for a source that is neither, and as :func:`read_yaml` does.
+    """
+    names = preset_names(kind)
+    if str(source) in names:
+        return read_yaml(presets_folder(kind) / f"{source}.yaml")
+    if isinstance(source, str | Path) and is_file_name(source):
+        return read_yaml(Path(source))
+    raise ValueError(
+        f"{kind} {str(source)!r:.60} is not one of {', '.join(names)}, nor a .yaml file{others}"
+    )

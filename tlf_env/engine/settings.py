@@ -6,8 +6,9 @@ import math
 from typing import NamedTuple
 
 from tlf_env.disturbances.model import changes_within_episode
+from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.observer import ObserverParameters
-from tlf_env.onboard.tracking import ControllerRow, controller, controller_row
+from tlf_env.onboard.tracking import ControllerRow, controller_row
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.scenario import Scenario
 

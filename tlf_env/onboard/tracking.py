@@ -2,30 +2,43 @@
 
 from __future__ import annotations
 
+import functools
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from pydantic import Field
 
 from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.presets import read_preset_or_file
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.trig import sincos
 from tlf_env.onboard.limiter import Limits, TwistLimits, limits_row
 from tlf_env.onboard.spacing import Spacing, SpacingRow, spacing_row
 
-HEADING_DAMPING_PER_S = 0.83
+
+@functools.cache
+def _consistent() -> dict[str, float]:
+    """The gains of the preset ``consistent``; gains are written in controller files only."""
+    gains: dict[str, float] = read_preset_or_file("controller", "consistent")["controller"]["gains"]
+    return gains
+
+
+def _gain(name: str) -> Any:
+    return Field(default_factory=lambda: _consistent()[name])
 
 
 class TrackingGains(Frozen):
-    """Gains of eqs (19) and (21).
+    """Gains of eqs (19) and (21). A gain left out is that of ``configs/controllers/consistent.yaml``.
 
     ``k_2_mm2_s`` / ``k_3_mm2`` is the damping of the heading, 1/s. η is the bound on slip that the
     complementary law assumes, in mm/s and rad/s at once, as printed.
     """
 
-    k_1_per_s: Positive = 0.23
-    k_2_mm2_s: NonNegative = HEADING_DAMPING_PER_S * 12e3
-    k_3_mm2: Positive = 12e3
-    eta: NonNegative = 1.9e-3
-    epsilon: Positive = 0.1
+    k_1_per_s: Positive = _gain("k_1_per_s")
+    k_2_mm2_s: NonNegative = _gain("k_2_mm2_s")
+    k_3_mm2: Positive = _gain("k_3_mm2")
+    eta: NonNegative = _gain("eta")
+    epsilon: Positive = _gain("epsilon")
 
 
 class Gains(NamedTuple):
@@ -58,66 +71,6 @@ class ControllerRow(NamedTuple):
     limits: Limits
     spacing: SpacingRow
     lead: float  # as a fraction of the time to the first preview
-
-
-# `consistent` reads the printed k₂ = 0.83 as the ratio k₂/k₃ in 1/s, of the same size as k₁; `printed`
-# takes it as it stands, 0.83 mm²/s, which leaves the heading almost undamped. See docs/controller.md.
-GAIN_PRESETS: dict[str, TrackingGains] = {
-    "consistent": TrackingGains(),
-    "printed": TrackingGains(k_2_mm2_s=0.83),
-}
-# `tuned` is not the paper's. The law keeps its form; its numbers and the limits are chosen for a robot
-# that slips and knows it.
-CONTROLLERS: dict[str, Controller] = {
-    **{name: Controller(gains=gains) for name, gains in GAIN_PRESETS.items()},
-    "tuned": Controller(
-        gains=TrackingGains(
-            k_1_per_s=1.3, k_2_mm2_s=105_350.0, k_3_mm2=2.15e4, eta=1e-4, epsilon=0.05
-        ),
-        limits=TwistLimits(
-            braking_error_mm=23.0,
-            forward_error_mm=119.0,
-            lateral_error_mm=150.0,
-            acceleration_mm_s2=195.0,
-            turning_acceleration_mm_s2=150.0,
-            yaw_acceleration_rad_s2=11.5,
-            yaw_rate_rad_s=1.5,
-            lateral_acceleration_mm_s2=165.0,
-            free_speed_mm_s=130.0,
-            free_reach_mm=27.0,
-            reverse_mm_s=20.0,
-            cancel_slip=True,
-        ),
-        spacing=Spacing(),
-        lead_s=0.02,
-    ),
-}
-
-
-def tracking_gains(name: str) -> TrackingGains:
-    """The gains of a preset of the paper's law, which has no limits.
-
-    Raises
-    ------
-    ValueError
-        naming the presets there are.
-    """
-    if name not in GAIN_PRESETS:
-        raise ValueError(f"gains {name!r} is not one of {', '.join(GAIN_PRESETS)}")
-    return GAIN_PRESETS[name]
-
-
-def controller(name: str) -> Controller:
-    """Gains and limits of a preset.
-
-    Raises
-    ------
-    ValueError
-        naming the presets there are.
-    """
-    if name not in CONTROLLERS:
-        raise ValueError(f"gains {name!r} is not one of {', '.join(CONTROLLERS)}")
-    return CONTROLLERS[name]
 
 
 def controller_row(

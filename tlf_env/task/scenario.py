@@ -21,13 +21,14 @@ from pydantic_core import PydanticCustomError
 
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Positive, no_switch
-from tlf_env.common.presets import preset_names, presets_folder, read_yaml
+from tlf_env.common.presets import is_file_name, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
+from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import PART_PATTERN
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
-from tlf_env.onboard.tracking import controller, controller_row
+from tlf_env.onboard.tracking import controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.parameters import RobotParameters
 from tlf_env.task.feasibility import disturbed, sensor_warnings, start_note, warnings_for
@@ -74,12 +75,8 @@ class FrozenDict(dict[str, float]):
 
 
 def _disturbance_preset(name: str) -> dict[str, Any]:
-    folder = presets_folder() / "disturbances"
-    if name not in preset_names(folder):
-        raise ValueError(
-            f"disturbance {name!r} is not one of {', '.join(preset_names(folder))}, nor a mapping"
-        )
-    return {"name": name, **read_yaml(folder / f"{name}.yaml")}
+    found = read_preset_or_file("disturbance", name, ", nor a mapping")
+    return {"name": name_of(Path(name)) if is_file_name(name) else name, **found}
 
 
 def whole_steps(duration_s: float, period_s: float) -> int | None:
@@ -351,22 +348,16 @@ def load_scenario(
 
 def _read_source(source: str | Path, control_period_s: float | None) -> dict[str, Any]:
     text = str(source)
-    if text in preset_names():
-        return {"name": text, **read_yaml(presets_folder() / f"{text}.yaml")}
     if not isinstance(source, str | Path):
         raise ValueError(
             f"scenario {text!r:.60} must be a preset's name, a file, a mapping or a Scenario"
         )
     path = Path(source)
-    if path.suffix in (".yaml", ".yml"):
-        return {"name": name_of(path), **read_yaml(path)}
     if path.suffix == ".csv":
         found = scenario_of_waypoints(path, control_period_s or DEFAULT_CONTROL_PERIOD_S)
         return {**found, "name": name_of(path)}
-    raise ValueError(
-        f"scenario {text!r} is neither a preset ({', '.join(preset_names())}), nor a .yaml file, "
-        "nor a .csv file of waypoints"
-    )
+    found = read_preset_or_file("scenario", source, ", nor a .csv file of waypoints")
+    return {"name": name_of(path) if is_file_name(source) else text, **found}
 
 
 def name_of(path: Path) -> str:

@@ -1,7 +1,8 @@
-"""Controllers from files: gains and limits in YAML, with what they need on board."""
+"""Controllers from YAML: presets and files of gains and limits, with what they need on board."""
 
 from __future__ import annotations
 
+import functools
 from pathlib import Path
 from typing import Any, Literal
 
@@ -9,11 +10,9 @@ from pydantic import ValidationError, field_validator
 
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen
-from tlf_env.common.presets import read_yaml
+from tlf_env.common.presets import is_file_name, preset_names, read_preset_or_file
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
-from tlf_env.onboard.tracking import Controller, controller
-
-SUFFIXES = (".yaml", ".yml")
+from tlf_env.onboard.tracking import Controller
 
 
 class ControllerFile(Frozen):
@@ -40,15 +39,36 @@ class ControllerFile(Frozen):
         return asked
 
 
-def load_controller(path: str | Path) -> ControllerFile:
-    """A controller file.
+def controller_names() -> list[str]:
+    """Names of the controller presets."""
+    return preset_names("controller")
+
+
+def load_controller(source: str | Path) -> ControllerFile:
+    """A controller file, by the name of a preset or its path.
 
     Raises
     ------
     ValueError
-        in one line, if the file cannot be read, or a key or a value in it is not allowed.
+        in one line, if there is no such preset or file, or a key or a value in it is not allowed.
     """
+    if is_file_name(source):  # a file may change between two calls
+        return _loaded(source)
+    return _preset(str(source))
+
+
+@functools.cache
+def _preset(name: str) -> ControllerFile:
+    return _loaded(name)
+
+
+def _loaded(source: str | Path) -> ControllerFile:
     try:
-        return ControllerFile.model_validate(read_yaml(Path(path)))
+        return ControllerFile.model_validate(read_preset_or_file("controller", source))
     except ValidationError as error:
-        raise ValueError(f"{path}: {one_line(error)}") from error
+        raise ValueError(f"{source}: {one_line(error)}") from error
+
+
+def controller(source: str | Path) -> Controller:
+    """Gains and limits of a preset or a controller file; as :func:`load_controller`."""
+    return load_controller(source).controller
