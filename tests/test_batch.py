@@ -34,7 +34,7 @@ def driven(plant: BatchPlant, steps: int) -> np.ndarray:
     out = []
     for _ in range(steps):
         plant.step(acted(plant))
-        out.append(plant.arrays.motions.T.copy())
+        out.append(plant.arrays.rows("motion").T.copy())
     return np.array(out)
 
 
@@ -44,7 +44,7 @@ def follow_alone(formation: Formation, steps: int) -> tuple[np.ndarray, np.ndarr
     for _ in range(steps):
         a.actions[0] = POLICY.predict(a.observations[0])[0]
         formation.step()
-        motions.append(a.motions[:, :, 0].T.copy())
+        motions.append(a.rows("motion")[:, :, 0].T.copy())
         touched.append(a.touched[0].copy())
     return np.array(motions), np.array(touched)
 
@@ -56,7 +56,7 @@ def check_against_pymunk(scenario: Any, seeds: range, steps: int) -> int:
     motions, flags = [], []
     for _ in range(steps):
         plant.step(acted(plant))
-        motions.append(plant.arrays.motions.T.copy())
+        motions.append(plant.arrays.rows("motion").T.copy())
         flags.append(plant.touched.copy())
     contacts = 0
     alone = Formation(load_scenario(scenario, plant="pymunk", end_on=()))
@@ -104,7 +104,7 @@ def test_robots_pass_through_each_other():
     assert plant.touched.all()
     assert not plant.touched_now.any()
     leader, follower = plant.state()[0, :, :2]
-    start = plant.arrays.starts[:2, :, 0].T
+    start = plant.arrays.rows("start")[:2, :, 0].T
     assert np.dot(leader - follower, start[0] - start[1]) < 0
 
 
@@ -166,7 +166,7 @@ def test_a_partial_reset_changes_nothing_elsewhere_and_begins_the_next_episode()
 def test_seeds_may_be_any_and_a_run_without_one_draws_its_own():
     plant = BatchPlant("infinity", 3, disturbance="start", **SHORT)
     plant.reset([7, 3, 7])
-    starts = plant.arrays.starts.copy()
+    starts = plant.arrays.rows("start").copy()
     assert (starts[..., 0] == starts[..., 2]).all()
     assert (starts[..., 0] != starts[..., 1]).any()
     fresh = BatchPlant("infinity", 2, **SHORT)

@@ -190,7 +190,7 @@ def test_robots_that_part_are_still_pushed_out_of_their_last_overlap():
 
 def test_a_rebuilt_space_repeats_a_collision_bit_for_bit():
     a, b = meet(head_on(20.0), 0.5), meet(head_on(20.0), 0.5)
-    assert np.array_equal(a.motions, b.motions)
+    assert np.array_equal(a.rows("motion"), b.rows("motion"))
 
 
 def test_a_reset_plant_has_forgotten_its_contacts():
@@ -240,7 +240,7 @@ def leader_states(robots: int, spacing_mm: float) -> np.ndarray:
     for forward, turn in rng.uniform([0.0, -0.3], [0.5, 0.3], (150, 2)):
         actions["robot_0"] = np.array([forward, turn])
         env.step(actions)
-        states = (arrays.motions, arrays.contacts, arrays.estimates)
+        states = (arrays.rows("motion"), arrays.rows("contact"), arrays.rows("estimate"))
         rows.append(np.concatenate([state[:, 0, 0] for state in states]))
     assert not arrays.touched.any()
     return np.array(rows)
@@ -261,6 +261,6 @@ def test_injected_slip_at_level_zero_is_the_nominal_run_bit_for_bit():
     for action in np.random.default_rng(0).uniform(-1, 1, (50, 2)):
         for env in envs:
             env.step({"robot_0": action})
-    nominal, zero, disturbed = (env.formation.arrays.motions for env in envs)
+    nominal, zero, disturbed = (env.formation.arrays.rows("motion") for env in envs)
     assert np.array_equal(nominal, zero)
     assert not np.array_equal(nominal, disturbed)

@@ -11,12 +11,22 @@ import yaml
 
 from baselines import ReferencePolicy
 from tlf_env.common.presets import preset_names, presets_folder
-from tlf_env.disturbances.channels import CHANNELS, NOMINAL_NOISE_MM, PATHS, STEP_CHANNELS, number
+from tlf_env.disturbances.channels import (
+    CHANNELS,
+    EPISODE,
+    NOMINAL_NOISE_MM,
+    PATHS,
+    SET_WITHIN_EPISODE,
+    STEP,
+    SUBSTEP,
+    number,
+    numbers,
+)
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.engine.formation import Formation
 from tlf_env.engine.layout import Sample
 from tlf_env.engine.radio import delayed_message
-from tlf_env.engine.settings import settings
+from tlf_env.engine.settings import make_settings
 from tlf_env.envs.parallel import parallel_env
 from tlf_env.onboard.parts import part_name
 from tlf_env.physics.parameters import RobotParameters, body, laden
@@ -61,7 +71,7 @@ NEEDS_MASS = ("payload.behind_mm", "payload.inertia_kg_mm2")
 def random_signal(path):
     low, high = sorted((CHANNELS[number(path)].nominal, SHOWS[path]))
     signal = {"type": "uniform", "low": low, "high": high}
-    return signal if number(path) >= STEP_CHANNELS else {**signal, "every_s": 0.1}
+    return signal if CHANNELS[number(path)].rate == EPISODE else {**signal, "every_s": 0.1}
 
 
 def tree(channels):
@@ -87,7 +97,7 @@ class Run:
     def __init__(self, formation, seconds=3.0, actions=None):
         a, scenario = formation.arrays, formation.scenario
         policy, rows = ReferencePolicy(), []
-        self.starts = a.starts[:, :, 0].T.copy()
+        self.starts = a.rows("start")[:, :, 0].T.copy()
         for k in range(round(seconds / scenario.control_period_s)):
             seen = a.observations[0].copy()
             a.actions[0] = policy.predict(seen)[0] if actions is None else actions(k)
@@ -95,7 +105,7 @@ class Run:
             c = formation.state()[:, :2]
             rows.append(
                 {
-                    "motion": a.motions[:, :, 0].T.copy(),
+                    "motion": a.rows("motion")[:, :, 0].T.copy(),
                     "applied": formation.applied().copy(),
                     "fix": a.samples[-1, FIX, :, 0].T - c,
                     "turned": a.samples[..., 0].sum(axis=0)[STEPS].T,
@@ -211,10 +221,11 @@ def test_a_channels_values_do_not_depend_on_other_channels(path):
 
 
 def test_channels_and_robots_draw_independently():
-    random = {path: random_signal(path) for path in PATHS[:STEP_CHANNELS]}
+    random = {path: random_signal(path) for path in SET_WITHIN_EPISODE}
     applied = run(random, seconds=20.0).applied[::5]  # one row per draw
-    scale = [SHOWS[path] - CHANNELS[number(path)].nominal for path in PATHS[:STEP_CHANNELS]]
-    draws = (applied[:, :, :STEP_CHANNELS] - applied[:1, :, :STEP_CHANNELS].mean()) / scale
+    scale = [SHOWS[path] - CHANNELS[number(path)].nominal for path in SET_WITHIN_EPISODE]
+    within = numbers(SUBSTEP, STEP)
+    draws = (applied[:, :, within] - applied[:1, :, within].mean()) / scale
     columns = draws.reshape(len(draws), -1).T
     alike = np.corrcoef(columns) - np.eye(len(columns))
     assert np.abs(alike).max() < 5 / math.sqrt(len(draws))
@@ -271,7 +282,7 @@ def test_a_robots_draws_do_not_depend_on_how_many_robots_there_are():
 def test_payloads_are_taken_off_when_an_episode_has_none():
     formation = make({"payload": {"mass_kg": {"type": "step", "value": 1.0, "at_s": 5.0}}})
     assert (formation.applied()[:, number("payload.mass_kg")] == 0).all()  # its value at t = 0
-    assert formation.arrays.bodies[0, :, 0] == pytest.approx(ROBOT.mass_kg)
+    assert formation.arrays.rows("body")[0, :, 0] == pytest.approx(ROBOT.mass_kg)
 
 
 # --- slip ------------------------------------------------------------------------------------------
@@ -525,7 +536,7 @@ def test_a_computing_delay_beyond_the_control_period_is_refused():
 def ages(found, robot=1, count=2000):
     """How many control steps beyond the gap each message is late, in steps 100 to 100 + ``count``."""
     formation = found.formation
-    a, s = formation.arrays, settings(formation.scenario)
+    a, s = formation.arrays, make_settings(formation.scenario)
     slots = a.messages.shape[1]
     a.messages[:] = 0.0
     out = []
@@ -622,7 +633,7 @@ def test_truth_broadcasts_the_true_motion_whatever_the_encoders_say(action):
     u_2 = 8.0 * action[1] + SLIPPING["slip.delta_2_rad_s"]
     assert found.message[:, :, 3] == pytest.approx(u_1, abs=1e-9)
     assert found.message[:, :, 4] == pytest.approx(u_2, abs=1e-9)
-    one = found.formation.arrays.slip_estimates[:2, :, 0]
+    one = found.formation.arrays.rows("slip")[:2, :, 0]
     assert one == pytest.approx(np.array([[v] * 3 for v in SLIPPING.values()]), abs=1e-9)
 
 
@@ -768,12 +779,12 @@ def scattered_starts(name):
     out = []
     for seed in range(1500):
         formation.reset(seed)
-        out.append(formation.arrays.starts[:, :, 0].T.copy())
+        out.append(formation.arrays.rows("start")[:, :, 0].T.copy())
     return np.array(out)
 
 
 def test_start_poses_scatter_as_asked():
-    straight = make().arrays.starts[:, :, 0].T
+    straight = make().arrays.rows("start")[:, :, 0].T
     off = scattered_starts("start") - straight
     count = len(off)
     for axis, std in ((0, 80.0), (1, 80.0), (2, 0.3)):
@@ -788,7 +799,7 @@ def test_start_poses_scatter_as_asked():
 def test_start_outlines_never_overlap_though_unchecked_draws_would():
     poses = scattered_starts("start")
     assert outline_gaps(poses).min() > START_MARGIN_MM
-    straight = make().arrays.starts[:, :, 0].T
+    straight = make().arrays.rows("start")[:, :, 0].T
     free = straight + np.random.default_rng(0).normal(size=poses.shape) * [80, 80, 0.3]
     assert (outline_gaps(free).min(axis=0) < 0).mean() > 0.05
 
@@ -797,10 +808,10 @@ def test_a_scatter_without_room_is_refused_and_given_poses_are_taken_as_they_are
     formation = make()
     with pytest.raises(ValueError, match=r"robot_1: no start pose without overlap"):
         make({"start": {"heading_std_rad": 1e-15}}, start_spacing_mm=221.0)
-    poses = formation.arrays.starts[:, :, 0].T + np.array([10.0, 20.0, 0.1])
+    poses = formation.arrays.rows("start")[:, :, 0].T + np.array([10.0, 20.0, 0.1])
     formation = make("start")
     formation.reset(0, poses=poses)
-    found = formation.arrays.starts[:, :, 0].T
+    found = formation.arrays.rows("start")[:, :, 0].T
     assert found == pytest.approx(poses)
 
 
@@ -844,7 +855,7 @@ def test_an_adversary_sets_channels_for_each_step(disturbance):
                 }
 
 
-@pytest.mark.parametrize("path", PATHS[:STEP_CHANNELS])
+@pytest.mark.parametrize("path", SET_WITHIN_EPISODE)
 def test_an_adversary_does_what_the_channel_does(path):
     imposed = parallel_env(
         "infinity", adversary=lambda env: {path: SHOWS[path]}, end_on=(), time_gap_s=GAP_S

@@ -283,7 +283,7 @@ class Signals:
             observation, info = observations["robot_0"], infos["robot_0"]
             self.innovations[k] = observation[axes] * scales
             self.nis[k] = info["innovation_nis"]
-            estimate = env.formation.arrays.estimates[:, 0, 0]
+            estimate = env.formation.arrays.rows("estimate")[:, 0, 0]
             self.heading_error[k] = estimate[2] - info["theta_rad"]
             self.heading_variance[k] = estimate[8]
         self.settled = slice(round(CAUGHT_UP_S / 0.001), None)

@@ -28,7 +28,7 @@ def drive(env: FormationParallelEnv, policy: Any, steps: int, seed: int = 0) -> 
         actions, state = policy.predict(rows, state, start)
         start = np.zeros_like(start)
         seen, *_ = env.step(dict(zip(env.agents, actions, strict=True)))
-        motions.append(env.formation.arrays.motions[:, :, 0].copy())
+        motions.append(env.formation.arrays.rows("motion")[:, :, 0].copy())
     return np.array(motions)
 
 
@@ -114,7 +114,7 @@ def test_each_robot_estimates_with_its_own_geometry() -> None:
     env = lineup({}, {"wheel_radius_mm": 60.0, "axle_width_mm": 200.0}, plant="kinematic")
     for _ in along_the_way(env, [0.3, 0.1], steps=200):
         truth = env.formation.state()[:, :2]
-    np.testing.assert_allclose(env.formation.arrays.estimates[:2, :, 0].T, truth, atol=0.2)
+    np.testing.assert_allclose(env.formation.arrays.rows("estimate")[:2, :, 0].T, truth, atol=0.2)
 
 
 def test_overrides_are_merged_into_the_common_robot() -> None:

@@ -365,10 +365,10 @@ def test_others_are_asked_as_sb3_asks(action: str, observation: str) -> None:
 def test_idle_others_stand_still() -> None:
     env = FormationEnv(learner="robot_0", others=Idle(), disturbance="none")
     env.reset(seed=0)
-    before = env.formation_env.formation.arrays.motions[:4].copy()
+    before = env.formation_env.formation.arrays.rows("motion")[:4].copy()
     for _ in range(25):
         env.step(np.array([0.2, 0.0], np.float32))
-    after = env.formation_env.formation.arrays.motions[:4]
+    after = env.formation_env.formation.arrays.rows("motion")[:4]
     np.testing.assert_allclose(after[:, 1:], before[:, 1:], atol=1e-9)
     assert after[1, 0, 0] > before[1, 0, 0] + 1.0
 
@@ -452,8 +452,8 @@ def test_reset_puts_the_robots_where_it_is_told() -> None:
     _, infos = env.reset(seed=0, options={"poses": poses})
     for pose, info in zip(poses, infos.values(), strict=True):
         assert [info["x_mm"], info["y_mm"], info["theta_rad"]] == pytest.approx(pose, abs=1e-9)
-    np.testing.assert_array_equal(env.formation.arrays.estimates[:3, :, 0].T, poses)
-    assert not env.formation.arrays.motions[4:11].any()
+    np.testing.assert_array_equal(env.formation.arrays.rows("estimate")[:3, :, 0].T, poses)
+    assert not env.formation.arrays.rows("motion")[4:11].any()
     # A follower's reference starts where it stands.
     assert [infos[agent]["position_error_mm"] for agent in AGENTS[1:]] == pytest.approx([0, 0])
 

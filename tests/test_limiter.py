@@ -258,7 +258,7 @@ def test_limits_hold_on_every_command_of_an_episode(disturbance):
     a, policy, robot = formation.arrays, ReferencePolicy("tuned"), body(scenario.robot)
     last, at_limit = np.zeros((2, 3)), np.zeros(3, dtype=int)
     for _ in range(scenario.horizon_steps):
-        slip = a.slip_estimates[:2, :, 0].copy()
+        slip = a.rows("slip")[:2, :, 0].copy()
         seen = a.observations[0] * SCALES
         cruise, error = seen[:, place("reference_u_1")], np.hypot(*seen[:, :2].T)
         ranges = [
@@ -267,7 +267,9 @@ def test_limits_hold_on_every_command_of_an_episode(disturbance):
         low, high = np.transpose(ranges)
         a.actions[0] = policy.predict(a.observations[0])[0]
         formation.step()
-        twist = np.array(odometry.py_func(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h))
+        twist = np.array(
+            odometry.py_func(a.rows("wanted")[0, :, 0], a.rows("wanted")[1, :, 0], robot.R, robot.h)
+        )
         step, lateral = np.abs(twist - last), np.abs(np.prod(twist + slip, axis=0))
         assert (twist[0] >= low - 1e-3).all()
         assert (twist[0] <= high + 1e-3).all()
@@ -294,8 +296,8 @@ def test_a_residual_of_zero_is_the_base_run_as_a_twist(base):
         one.arrays.actions[0] = policy.predict(one.arrays.observations[0])[0]
         one.step()
         other.step()
-        assert one.arrays.motions.tobytes() == other.arrays.motions.tobytes()
-        assert one.arrays.wanted.tobytes() == other.arrays.wanted.tobytes()
+        assert one.arrays.rows("motion").tobytes() == other.arrays.rows("motion").tobytes()
+        assert one.arrays.rows("wanted").tobytes() == other.arrays.rows("wanted").tobytes()
 
 
 def test_a_residual_stays_within_the_limits_of_its_base():
@@ -314,7 +316,9 @@ def test_a_residual_stays_within_the_limits_of_its_base():
         low, high = np.transpose(ranges)
         a.actions[0] = rng.uniform(-1, 1, a.actions[0].shape)
         formation.step()
-        u_1, u_2 = odometry.py_func(a.wanted[0, :, 0], a.wanted[1, :, 0], robot.R, robot.h)
+        u_1, u_2 = odometry.py_func(
+            a.rows("wanted")[0, :, 0], a.rows("wanted")[1, :, 0], robot.R, robot.h
+        )
         assert (u_1 >= low - 1e-3).all()
         assert (u_1 <= high + 1e-3).all()
         assert (np.abs(u_1 * u_2) <= ALL.lateral + 0.05).all()

@@ -221,7 +221,7 @@ def test_previews_are_the_later_references(preview_s):
     ahead, steps = round(preview_s / 0.02), 600
     seen, poses, twists = [], [], []
     for _ in range(steps):
-        estimates = env.formation.arrays.estimates[:3, :, 0].T
+        estimates = env.formation.arrays.rows("estimate")[:3, :, 0].T
         row = []
         for agent, (x, y, theta) in zip(env.agents, estimates, strict=True):
             names = ("forward", "right", "sin_turn", "cos_turn", "u_1", "u_2")

@@ -35,7 +35,7 @@ def test_action_is_the_law_at_the_formations_estimates(preset):
     compared = 0
     for _ in range(800):
         actions, _ = policy.predict(stacked(observations))
-        estimates = env.formation.arrays.estimates[:3, :, 0].T
+        estimates = env.formation.arrays.rows("estimate")[:3, :, 0].T
         for action, (x, y, theta), info, observation in zip(
             actions, estimates, infos.values(), observations.values(), strict=True
         ):

@@ -135,7 +135,7 @@ def test_a_residual_of_zero_is_the_reference_bitwise(plant: str, dtype: str, gai
         reference.step()
         residual.step(still)
         a, b = reference.env.formation.arrays, residual.formation.arrays
-        np.testing.assert_array_equal(a.motions, b.motions)
+        np.testing.assert_array_equal(a.rows("motion"), b.rows("motion"))
         np.testing.assert_array_equal(a.observations[..., entries], b.observations[..., entries])
 
 
@@ -206,7 +206,7 @@ def test_sensor_has_every_fix_of_every_millisecond_once() -> None:
     for robot in range(3):
         assert len(np.unique(read[:, robot, 0])) == len(read)
     wheels = read[..., 2:].sum(axis=0)
-    motions = every_20_ms.formation.arrays.motions[-2:, :, 0].T
+    motions = every_20_ms.formation.arrays.rows("motion")[-2:, :, 0].T
     np.testing.assert_allclose(wheels, motions, atol=1e-9)
 
 
@@ -244,7 +244,7 @@ def test_a_follower_hears_its_predecessor_as_it_was_one_gap_ago() -> None:
     for k in range(60):
         arrays = env.formation.arrays
         odometry = (arrays.observations[0] * scales)[:, u]
-        said.append(np.hstack([arrays.estimates[:3, :, 0].T, odometry]))
+        said.append(np.hstack([arrays.rows("estimate")[:3, :, 0].T, odometry]))
         rows = physical(env, seen)
         old = said[max(k - 20, 0)]
         for r, row in enumerate(rows):
@@ -284,7 +284,7 @@ def test_previews_are_the_later_references(task: str) -> None:
         for steps, name in ((0, "0"), (15, "0.3"), (50, "1")):
             foreseen = []
             for r, row in enumerate(rows):
-                x, y, theta = env.formation.arrays.estimates[:3, r, 0]
+                x, y, theta = env.formation.arrays.rows("estimate")[:3, r, 0]
                 forward, right = row[f"forward_in_{name}_s"], row[f"right_in_{name}_s"]
                 turn = np.arctan2(row[f"sin_turn_in_{name}_s"], row[f"cos_turn_in_{name}_s"])
                 foreseen.append(

@@ -274,7 +274,7 @@ def test_the_scenario_sets_the_filters_numbers():
     expected = slip_ekf_constants(SlipEkfParameters(fix_variance_mm2=1.5), 0.002)
     formation = Formation(scenario)
     formation.reset(0)
-    found = formation.arrays.slip_ekfs
+    found = formation.arrays.rows("slip_ekf")
     np.testing.assert_array_equal(found, np.tile(np.array(expected)[:, None, None], (1, 3, 1)))
     with pytest.raises(ValueError, match=r"ekf_slip.*fix_variance_mm2"):
         load_scenario("infinity", ekf_slip={"fix_variance_mm2": 0.0})
@@ -591,7 +591,7 @@ class Steps:
             a.actions[0] = policy.predict(a.observations[0])[0]
             formation.step()
             now = a.applied[rows, 0, 0].copy()
-            off.append(a.slip_estimates[:2, 0, 0] - now)
+            off.append(a.rows("slip")[:2, 0, 0] - now)
             if (now != before).any() and k > 500:
                 new.append(k)
                 motion.append(np.abs(now - before))
@@ -666,7 +666,7 @@ class Loop:
         for _ in range(scenario.horizon_steps):
             a.actions[0] = policy.predict(a.observations[0])[0]
             formation.step()
-            z = SlipEstimate(*a.slip_estimates[:, 0, 0])
+            z = SlipEstimate(*a.rows("slip")[:, 0, 0])
             slips.append((z.delta_1, z.delta_2))
             deviations.append((z.p_11**0.5, z.p_22**0.5))
         self.slips, self.deviations = np.array(slips), np.array(deviations)

@@ -120,7 +120,7 @@ def test_what_is_heard_is_the_predecessors_estimate_as_it_stands():
         formation.step()
         seen = a.observations[0, :, FIRST : FIRST + 6] * SCALES[FIRST : FIRST + 6]
         assert not seen[0].any()
-        x, y, theta = a.estimates[:3, :, 0]
+        x, y, theta = a.rows("estimate")[:3, :, 0]
         for r in (1, 2):
             d_x, d_y = x[r - 1] - x[r], y[r - 1] - y[r]
             sin, cos = math.sin(theta[r]), math.cos(theta[r])

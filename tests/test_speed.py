@@ -7,8 +7,8 @@ import pytest
 
 from baselines.speed import speed
 from tlf_env import BatchPlant
+from tlf_env.engine.arrays import make_arrays, padded
 from tlf_env.engine.formation import reference_table
-from tlf_env.engine.layout import make_arrays, padded
 from tlf_env.envs.vector import FormationVectorEnv
 from tlf_env.task.actions import REFERENCE
 
@@ -74,7 +74,7 @@ def test_formations_are_put_where_the_recorded_ones_stood(moments):
     for number, infos in enumerate(np.split(plant.infos, 3)):
         recorded = moments.arrays[number]
         assert np.array_equal(infos, recorded.infos[moments.lanes])
-        here = plant.arrays.motions[:, :, number * count : (number + 1) * count]
+        here = plant.arrays.rows("motion")[:, :, number * count : (number + 1) * count]
         assert np.array_equal(here, recorded.motions[:, :, moments.lanes])
 
 
@@ -111,7 +111,7 @@ def test_rows_of_many_lanes_are_an_odd_number_of_cache_lines_long(lanes):
     assert lanes < 64 or (columns * 8 / 64) % 2 == 1
     scenario = BatchPlant("infinity", 1).scenario
     arrays = make_arrays([scenario], reference_table(scenario), min(lanes, 100))
-    assert arrays.motions.shape[2] == padded(min(lanes, 100))
+    assert arrays.rows("motion").shape[2] == padded(min(lanes, 100))
 
 
 def resident_bytes() -> int:

@@ -6,47 +6,20 @@ import numpy as np
 import pytest
 
 import tlf_env
+from tlf_env.disturbances.channels import SUBSTEP, Effects, numbers
 from tlf_env.engine import drivers
+from tlf_env.engine.arrays import Arrays, make_arrays, make_variants
+from tlf_env.engine.effects import evaluate
 from tlf_env.engine.excerpt import empty_excerpt
 from tlf_env.engine.formation import reference_table
-from tlf_env.engine.layout import (
-    Arrays,
-    make_arrays,
-    make_variants,
-    read_effects,
-    read_sensors,
-    read_trace,
-    write_sample,
-    write_sensors,
-    write_trace,
-)
-from tlf_env.engine.settings import Settings, settings
-from tlf_env.engine.substeps import (
-    Draw,
-    Order,
-    asked_torques,
-    disturbed_encoders,
-    evaluate,
-    floor_under,
-    sense_robot,
-    trace_drive,
-    undisturbed,
-)
+from tlf_env.engine.layout import Draw, Order, Sample, array_reader, array_writer
+from tlf_env.engine.sensors import disturbed_encoders, sense_robot
+from tlf_env.engine.settings import Settings, make_settings
+from tlf_env.engine.substeps import asked_torques, floor_under, trace_drive, undisturbed
 from tlf_env.engine.tiles import WIDTH, advance
-from tlf_env.numerics.compiled import driver
-from tlf_env.onboard.estimator import read_ekf, read_estimate, write_estimate
-from tlf_env.onboard.slip_estimator import read_slip_ekf, read_slip_estimate, write_slip_estimate
-from tlf_env.onboard.wheel_loop import read_loop_state, read_wheel_loop, write_loop_state
+from tlf_env.numerics.compiled import driver, reader, writer
 from tlf_env.physics.kernel import substep
-from tlf_env.physics.state import (
-    Push,
-    advance_pose,
-    read_body,
-    read_contact,
-    read_motion,
-    write_contact,
-    write_motion,
-)
+from tlf_env.physics.state import Push, advance_pose
 from tlf_env.task.actions import TWIST
 
 EVERYTHING: dict[str, Any] = {
@@ -75,20 +48,20 @@ def thrown_about(lanes: int, seed: int = 0, **overrides: Any) -> tuple[Arrays, S
     """Formations with velocities and actions at random: rolling, sliding, at rest, steering stuck."""
     scenario = tlf_env.parallel_env("infinity", **({"plant": "batch"} | overrides)).scenario
     table = reference_table(scenario)
-    a, s = make_arrays([scenario], table, lanes), settings(scenario)
+    a, s = make_arrays([scenario], table, lanes), make_settings(scenario)
     a.seeds[:] = seed + np.arange(lanes)
     everyone = np.ones(lanes, dtype=np.bool_)
     drivers.start(a, make_variants([scenario]), everyone, np.zeros((0, 3)), s)
     drivers.look(a, everyone, True, s)
     for lane in range(lanes):
         rng = np.random.default_rng(1000 * seed + lane)
-        robots = a.motions.shape[1]
+        robots = a.rows("motion").shape[1]
         scale = rng.choice([0.0, 1e-3, 0.3, 1.0], (1, robots))
         speeds = np.array([300, 300, 2, 5, 10, 10, 20])[:, None] * rng.normal(size=(7, robots))
-        a.motions[4:11, :, lane] = scale * speeds
+        a.rows("motion")[4:11, :, lane] = scale * speeds
         stuck = rng.random(robots) < 0.5
-        a.motions[7, stuck, lane] = a.motions[6, stuck, lane]
-        a.motions[2:4, :, lane] += rng.uniform(-4, 4, (2, robots))
+        a.rows("motion")[7, stuck, lane] = a.rows("motion")[6, stuck, lane]
+        a.rows("motion")[2:4, :, lane] += rng.uniform(-4, 4, (2, robots))
         a.actions[lane] = rng.uniform(-1.2, 1.2, (robots, 2))
     return a, s
 
@@ -120,48 +93,64 @@ def test_lanes_give_the_same_bits_alone_and_together(overrides):
 @pytest.mark.parametrize("lanes", [1, 2, 3, 5, 7, 64])
 def test_what_else_is_in_the_arrays_does_not_matter(lanes):
     few, many = step_all(*thrown_about(lanes)), step_all(*thrown_about(64))
-    for name in ("motions", "contacts", "estimates", "traces", "sensors", "loop_states"):
-        got, wanted = (getattr(arrays, name)[:, :, :lanes] for arrays in (few, many))
+    for name in ("motion", "contact", "estimate", "trace", "sensors", "loop_state"):
+        got, wanted = (arrays.rows(name)[:, :, :lanes] for arrays in (few, many))
         assert got.tobytes() == wanted.tobytes()
 
 
 def test_rolling_and_sliding_robots_and_a_stuck_steering_occur():
     a, _ = thrown_about(64)
-    stuck = a.motions[6] == a.motions[7]
+    stuck = a.rows("motion")[6] == a.rows("motion")[7]
     after = step_all(*thrown_about(64))
-    slides = after.contacts[10:13].any(axis=0)
+    slides = after.rows("contact")[10:13].any(axis=0)
     assert 0.1 < stuck.mean() < 0.9
     assert 0.05 < slides.mean() < 0.95
+
+
+OF_SUBSTEPS = tuple(numbers(SUBSTEP).tolist())
+assert tuple(range(10)) == OF_SUBSTEPS  # one after the other, as `read_effects` takes them
+read_effects, write_sample = reader(Effects), writer(Sample)
+read_body, read_wheel_loop = array_reader("body"), array_reader("wheel_loop")
+read_ekf, read_slip_ekf = array_reader("ekf"), array_reader("slip_ekf")
+read_motion, write_motion = array_reader("motion"), array_writer("motion")
+read_contact, write_contact = array_reader("contact"), array_writer("contact")
+read_loop_state, write_loop_state = array_reader("loop_state"), array_writer("loop_state")
+read_sensors, write_sensors = array_reader("sensors"), array_writer("sensors")
+read_estimate, write_estimate = array_reader("estimate"), array_writer("estimate")
+read_slip, write_slip = array_reader("slip"), array_writer("slip")
+read_trace, write_trace = array_reader("trace"), array_writer("trace")
+read_command = array_reader("command")
 
 
 @driver
 def one_by_one(a: Arrays, s: Settings) -> None:
     """What :func:`advance` does for wheels under twist, no dead time and no patches, without a tile."""
     push = Push(0.0, 0.0, 0.0)
-    for lane in range(a.motions.shape[2]):
-        for r in range(a.motions.shape[1]):
+    for lane in range(a.states.shape[2]):
+        for r in range(a.states.shape[1]):
             body, loop, ekf, slip_ekf = (
-                read_body(a.bodies, r, lane),
-                read_wheel_loop(a.wheel_loops, r, lane),
-                read_ekf(a.ekfs, r, lane),
-                read_slip_ekf(a.slip_ekfs, r, lane),
+                read_body(a.constants, r, lane),
+                read_wheel_loop(a.constants, r, lane),
+                read_ekf(a.constants, r, lane),
+                read_slip_ekf(a.constants, r, lane),
             )
-            wanted_l, wanted_r = a.commands[0, r, lane], a.commands[1, r, lane]
+            wanted_l, wanted_r = read_command(a.states, r, lane)
             order = Order(float(TWIST), wanted_l, wanted_r, 0.0, 0.0, 0.0, 0.0)
             for k in range(s.substeps):
                 tick = a.clock[lane, 0] + k
                 if s.changing:
-                    evaluate(a, lane, r, 0, 10, tick, s)
+                    for channel in OF_SUBSTEPS:
+                        evaluate(a, lane, r, channel, tick, s)
                 effects = read_effects(a.applied, r, lane)
-                sensors = read_sensors(a.sensors, r, lane)
+                sensors = read_sensors(a.states, r, lane)
                 asked_l, asked_r, held = asked_torques(
-                    body, loop, order, read_loop_state(a.loop_states, r, lane), sensors, k
+                    body, loop, order, read_loop_state(a.states, r, lane), sensors, k
                 )
                 drive = undisturbed(asked_l, asked_r, effects)
                 motion, contact = substep(
                     body,
-                    read_motion(a.motions, r, lane),
-                    read_contact(a.contacts, r, lane),
+                    read_motion(a.states, r, lane),
+                    read_contact(a.states, r, lane),
                     floor_under(body, effects, drive),
                     push,
                     drive.given_l,
@@ -169,7 +158,7 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                     s.dt,
                 )
                 trace = trace_drive(
-                    read_trace(a.traces, r, lane), body.torque_limit, drive, motion, contact, s.dt
+                    read_trace(a.states, r, lane), body.torque_limit, drive, motion, contact, s.dt
                 )
                 motion = advance_pose(motion, s.dt)
                 draw = Draw(a.seeds[lane], r, a.clock[lane, 2], tick + 1)
@@ -181,8 +170,8 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                     motion,
                     disturbed_encoders(motion, effects, draw),
                     sensors,
-                    read_estimate(a.estimates, r, lane),
-                    read_slip_estimate(a.slip_estimates, r, lane),
+                    read_estimate(a.states, r, lane),
+                    read_slip(a.states, r, lane),
                     trace,
                     draw,
                     order,
@@ -190,13 +179,13 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                     s.estimator,
                     s.dt,
                 )
-                write_motion(a.motions, r, lane, motion)
-                write_contact(a.contacts, r, lane, contact)
-                write_loop_state(a.loop_states, r, lane, held)
-                write_sensors(a.sensors, r, lane, sensors)
-                write_estimate(a.estimates, r, lane, estimate)
-                write_slip_estimate(a.slip_estimates, r, lane, slip)
-                write_trace(a.traces, r, lane, trace)
+                write_motion(a.states, r, lane, motion)
+                write_contact(a.states, r, lane, contact)
+                write_loop_state(a.states, r, lane, held)
+                write_sensors(a.states, r, lane, sensors)
+                write_estimate(a.states, r, lane, estimate)
+                write_slip(a.states, r, lane, slip)
+                write_trace(a.states, r, lane, trace)
                 write_sample(a.samples[k], r, lane, sample)
         a.clock[lane, 0] += s.substeps
 
@@ -215,7 +204,7 @@ def test_a_tile_gives_the_bits_of_the_laws_run_one_by_one(disturbance, estimator
     (a, s), (b, _) = (
         thrown_about(lanes, disturbance=disturbance, estimator=estimator) for _ in range(2)
     )
-    a.commands[:] = b.commands[:] = commands
+    a.rows("command")[:] = b.rows("command")[:] = commands
     for _ in range(5):
         one_by_one(a, s)
         in_tiles(b, np.arange(lanes), s)

@@ -251,11 +251,11 @@ def test_sensitivity_of_the_running_robot_is_that_of_the_digital_loop():
         env.reset(seed=0)
         errors = np.empty(settle + 2 * count)
         wanted = mean + swing * np.sin(omega * np.arange(len(errors)) * PERIOD_S)
-        sensors = env.formation.arrays.sensors
+        sensors = env.formation.arrays.rows("sensors")
         for i, one in enumerate(wanted):
             errors[i] = one - sensors[2, 0, 0]
             env.step({"robot_0": np.full(2, one / speed_scale)})
-            assert i < settle or abs(env.formation.arrays.traces[5, 0, 0]) < LIMIT * TO_LAW
+            assert i < settle or abs(env.formation.arrays.rows("trace")[5, 0, 0]) < LIMIT * TO_LAW
         tone = np.exp(-1j * omega * np.arange(len(errors)) * PERIOD_S)[settle:]
         error, reference = errors[settle:] - errors[settle:].mean(), wanted[settle:] - mean
         measured = (error * tone).sum() / (reference * tone).sum()

@@ -13,12 +13,12 @@ from typing import Any
 import numpy as np
 
 from tlf_env.common.files import atomic
+from tlf_env.engine import readout
+from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.batch import BatchPlant
 from tlf_env.engine.formation import Formation
-from tlf_env.engine.layout import Arrays
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import Factory, Policy, predicted
-from tlf_env.physics.state import Motion
 from tlf_env.task.info import Info
 from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, string_metrics
 from tlf_env.task.scenario import Scenario
@@ -63,9 +63,6 @@ FROM_WHEELS = (
     "omega_r_command_rad_s",
 )
 INFO_PLACES = [Info._fields.index(name) for name in FROM_INFO]
-PSI, THETA, OMEGA_L, OMEGA_R = (
-    Motion._fields.index(name) for name in ("psi", "theta", "omega_l", "omega_r")
-)
 
 
 @dataclass(frozen=True)
@@ -211,10 +208,12 @@ class _Tape:
         """Row ``k``."""
         a = self._arrays
         self._infos[:, k] = a.infos[:, :, INFO_PLACES]
-        self._wheels[:, k, 0] = (a.motions[PSI] - a.motions[THETA]).T
-        self._wheels[:, k, 1] = a.motions[OMEGA_L].T
-        self._wheels[:, k, 2] = a.motions[OMEGA_R].T
-        self._wheels[:, k, 3:] = a.wanted.transpose(2, 0, 1)
+        motion, wanted = readout.named(a, "motion"), readout.named(a, "wanted")
+        self._wheels[:, k, 0] = motion.psi - motion.theta
+        self._wheels[:, k, 1] = motion.omega_l
+        self._wheels[:, k, 2] = motion.omega_r
+        self._wheels[:, k, 3] = wanted.left
+        self._wheels[:, k, 4] = wanted.right
         if a.lost_now.any() or a.touched_now.any():
             self._lost_at_s[a.lost_now] = k * period_s
             self._touched_at_s[a.touched_now] = k * period_s

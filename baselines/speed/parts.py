@@ -7,6 +7,7 @@ import time
 import numpy as np
 from numba import types
 
+from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.batch import BatchPlant
 from tlf_env.engine.drivers import (
     LANES_AT_ONCE,
@@ -15,7 +16,6 @@ from tlf_env.engine.drivers import (
     take_all_actions,
     transmit_all,
 )
-from tlf_env.engine.layout import Arrays
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import driver

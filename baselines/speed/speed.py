@@ -18,8 +18,8 @@ import numpy as np
 
 from baselines.policies.reference import ReferencePolicy
 from baselines.runs.run import versions
+from tlf_env.engine.arrays import Arrays, make_arrays
 from tlf_env.engine.batch import BatchPlant
-from tlf_env.engine.layout import Arrays, make_arrays
 from tlf_env.envs.parallel import parallel_env
 from tlf_env.envs.vector import FormationVectorEnv
 from tlf_env.task.actions import REFERENCE

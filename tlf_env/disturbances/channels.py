@@ -1,82 +1,117 @@
-"""The channels through which a disturbance acts: what each is without it, its range, its random stream."""
+"""The channels through which a disturbance acts: neutral value, range, rate and random stream of each."""
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Literal, NamedTuple
+
+import numpy as np
 
 NOMINAL_NOISE_MM = math.sqrt(0.2)  # σ_m of eq. (37): a variance of 0.2 mm² per coordinate
 
-# Numbers of random streams that belong to no channel. A number, once given, is never given again: it is
-# part of every result. Channels use FIRST_CHANNEL_STREAM + their place below, so their order is fixed too.
+# Streams of random numbers that belong to no channel. A stream's number is part of every recorded
+# result: it never changes, and a number once used is never used for anything else.
 POSITION_NOISE = 1
 START_POSE = 2
 ENCODER_NOISE = 3
 RADIO_JITTER = 4
 RADIO_DROPOUT = 5
 MIXTURE = 6
-FIRST_CHANNEL_STREAM = 100
+
+Rate = Literal["substep", "step", "episode"]
+SUBSTEP: Rate = "substep"  # acts in the plant and the sensors, so it is evaluated in every substep
+STEP: Rate = "step"  # evaluated once per control step
+EPISODE: Rate = "episode"  # evaluated once, at the start
 
 
 class Channel(NamedTuple):
-    """One channel: path in YAML, value without a disturbance, and the range that makes sense."""
+    """One channel. The places in :data:`CHANNELS` are free; path, stream and nominal value never change.
 
-    path: str
+    The nominal value is the one without a disturbance. A recorded result counts it as absent, so a
+    channel may be added at any time without changing what older results are compared by.
+    """
+
+    path: str  # in YAML
+    stream: int  # of its random numbers
+    rate: Rate
     nominal: float
-    low: float
+    low: float  # smallest and largest value allowed
     high: float
     meaning: str
 
 
 CHANNELS = (
-    # every substep
-    Channel(
-        "slip.delta_1_mm_s", 0.0, -2000.0, 2000.0, "slip δ₁ of eq. (14), under both drive wheels"
-    ),
-    Channel("slip.delta_2_rad_s", 0.0, -20.0, 20.0, "slip δ₂ of eq. (14)"),
-    Channel("tyre.friction_scale", 1.0, 0.0, 100.0, "factor on the friction of all tyres"),
-    Channel("position.bias_x_mm", 0.0, -1e4, 1e4, "offset of the position fixes, x"),
-    Channel("position.bias_y_mm", 0.0, -1e4, 1e4, "offset of the position fixes, y"),
-    Channel(
-        "position.noise_std_mm",
-        NOMINAL_NOISE_MM,
-        0.0,
-        1e3,
-        "white noise of each coordinate of a fix",
-    ),
-    Channel("encoder.noise_std_rad", 0.0, 0.0, 1.0, "white noise of each encoder reading"),
-    Channel("encoder.quantum_rad", 0.0, 0.0, 1.0, "resolution of the encoders"),
-    Channel(
-        "actuator.torque_gain_l", 1.0, 0.0, 10.0, "torque delivered over torque asked for, left"
-    ),
-    Channel("actuator.torque_gain_r", 1.0, 0.0, 10.0, "the same, right"),
-    # every control step
-    Channel("actuator.dead_time_s", 0.0, 0.0, 0.1, "delay between the wheel loop and the torque"),
-    Channel(
-        "actuator.computing_delay_s", 0.0, 0.0, 1.0, "delay between an action and the wheel loops"
-    ),
-    Channel(
-        "radio.jitter_s", 0.0, 0.0, 10.0, "a message is up to this much older than the time gap"
-    ),
-    Channel("radio.dropout", 0.0, 0.0, 0.999, "share of messages that never arrive"),
-    # once per episode
-    Channel("payload.mass_kg", 0.0, 0.0, 100.0, "mass put on the chassis"),
-    Channel("payload.behind_mm", 0.0, -200.0, 200.0, "its place behind the axle's midpoint"),
-    Channel("payload.inertia_kg_mm2", 0.0, 0.0, 1e7, "its inertia about its own centre"),
-    Channel(
-        "start.position_std_mm", 0.0, 0.0, 1e4, "scatter of the start positions, per coordinate"
-    ),
-    Channel("start.heading_std_rad", 0.0, 0.0, 10.0, "scatter of the start headings"),
-)
+    Channel("slip.delta_1_mm_s", 100, SUBSTEP, 0.0, -2000.0, 2000.0, "slip δ₁ of eq. (14), both drive wheels"),
+    Channel("slip.delta_2_rad_s", 101, SUBSTEP, 0.0, -20.0, 20.0, "slip δ₂ of eq. (14)"),
+    Channel("tyre.friction_scale", 102, SUBSTEP, 1.0, 0.0, 100.0, "factor on the friction of all tyres"),
+    Channel("position.bias_x_mm", 103, SUBSTEP, 0.0, -1e4, 1e4, "offset of the position fixes, x"),
+    Channel("position.bias_y_mm", 104, SUBSTEP, 0.0, -1e4, 1e4, "offset of the position fixes, y"),
+    Channel("position.noise_std_mm", 105, SUBSTEP, NOMINAL_NOISE_MM, 0.0, 1e3, "white noise of a fix"),
+    Channel("encoder.noise_std_rad", 106, SUBSTEP, 0.0, 0.0, 1.0, "white noise of each encoder reading"),
+    Channel("encoder.quantum_rad", 107, SUBSTEP, 0.0, 0.0, 1.0, "resolution of the encoders"),
+    Channel("actuator.torque_gain_l", 108, SUBSTEP, 1.0, 0.0, 10.0, "delivered over commanded torque, left"),
+    Channel("actuator.torque_gain_r", 109, SUBSTEP, 1.0, 0.0, 10.0, "delivered over commanded torque, right"),
+    Channel("actuator.dead_time_s", 110, STEP, 0.0, 0.0, 0.1, "delay from wheel loop to torque"),
+    Channel("actuator.computing_delay_s", 111, STEP, 0.0, 0.0, 1.0, "delay from action to wheel loops"),
+    Channel("radio.jitter_s", 112, STEP, 0.0, 0.0, 10.0, "largest extra age of a message"),
+    Channel("radio.dropout", 113, STEP, 0.0, 0.0, 0.999, "share of messages that never arrive"),
+    Channel("payload.mass_kg", 114, EPISODE, 0.0, 0.0, 100.0, "mass put on the chassis"),
+    Channel("payload.behind_mm", 115, EPISODE, 0.0, -200.0, 200.0, "its distance behind the axle's midpoint"),
+    Channel("payload.inertia_kg_mm2", 116, EPISODE, 0.0, 0.0, 1e7, "its inertia about its own centre"),
+    Channel("start.position_std_mm", 117, EPISODE, 0.0, 0.0, 1e4, "scatter of the starts, per coordinate"),
+    Channel("start.heading_std_rad", 118, EPISODE, 0.0, 0.0, 10.0, "scatter of the start headings"),
+)  # fmt: skip
+
+
+class Effects(NamedTuple):
+    """Values of the channels of every substep, for one robot; each field is a path with ``_`` for ``.``."""
+
+    slip_delta_1_mm_s: float
+    slip_delta_2_rad_s: float
+    tyre_friction_scale: float
+    position_bias_x_mm: float
+    position_bias_y_mm: float
+    position_noise_std_mm: float
+    encoder_noise_std_rad: float
+    encoder_quantum_rad: float
+    actuator_torque_gain_l: float
+    actuator_torque_gain_r: float
+
+
 PATHS = tuple(channel.path for channel in CHANNELS)
-SUBSTEP_CHANNELS = 10
-STEP_CHANNELS = 14
+SET_WITHIN_EPISODE = tuple(channel.path for channel in CHANNELS if channel.rate != EPISODE)
 
 
 def number(path: str) -> int:
-    """A channel's place."""
+    """A channel's place in :data:`CHANNELS`."""
     return PATHS.index(path)
 
+
+def numbers(*rates: Rate) -> np.ndarray:
+    """Places of the channels of some rates, in order."""
+    return np.array([i for i, one in enumerate(CHANNELS) if one.rate in rates], dtype=np.int64)
+
+
+def nominal_effects() -> Effects:
+    """The effects without a disturbance."""
+    return Effects(*(CHANNELS[i].nominal for i in numbers(SUBSTEP)))
+
+
+def effects_of_group(group: str) -> list[str]:
+    """Fields of :class:`Effects` that belong to a group of channels."""
+    return [name for name in Effects._fields if name.startswith(f"{group}_")]
+
+
+def _check_table() -> None:
+    streams = [channel.stream for channel in CHANNELS]
+    if len(set(streams)) < len(streams) or min(streams) < 100:
+        raise ValueError("every channel needs a stream of its own, from 100 on")
+    fields = tuple(CHANNELS[i].path.replace(".", "_") for i in numbers(SUBSTEP))
+    if Effects._fields != fields:
+        raise ValueError(f"Effects must have the fields {fields}, has {Effects._fields}")
+
+
+_check_table()
 
 DEAD_TIME = number("actuator.dead_time_s")
 COMPUTING_DELAY = number("actuator.computing_delay_s")

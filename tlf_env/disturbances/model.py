@@ -13,9 +13,9 @@ import numpy as np
 from pydantic import BeforeValidator, FiniteFloat, model_validator
 
 from tlf_env.common.models import Frozen, NonNegative, Positive
-from tlf_env.disturbances.channels import CHANNELS, PATHS, SUBSTEP_CHANNELS
+from tlf_env.disturbances.channels import CHANNELS, PATHS, SUBSTEP, number, numbers
 from tlf_env.disturbances.signals import Constant, Signal
-from tlf_env.numerics.compiled import law, reader
+from tlf_env.numerics.compiled import law
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Motion
 
@@ -30,7 +30,7 @@ ChannelSignal = Annotated[Signal, BeforeValidator(_plain_number)]
 
 
 def _nominal(path: str) -> Constant:
-    return Constant(value=CHANNELS[PATHS.index(path)].nominal)
+    return Constant(value=CHANNELS[number(path)].nominal)
 
 
 class SlipChannels(Frozen):
@@ -126,7 +126,7 @@ class Disturbance(Frozen):
         signal = self.signal(path)
         if not isinstance(signal, Constant):
             return None
-        return leveled(CHANNELS[PATHS.index(path)].nominal, signal.value, self.level)
+        return leveled(CHANNELS[number(path)].nominal, signal.value, self.level)
 
     @model_validator(mode="after")
     def _check_ranges(self) -> Self:
@@ -147,21 +147,6 @@ class Disturbance(Frozen):
         return self
 
 
-class Effects(NamedTuple):
-    """What the channels of every substep do to one robot; the first ten of :data:`CHANNELS`."""
-
-    delta_1: float  # mm/s
-    delta_2: float  # rad/s
-    grip: float
-    bias_x: float  # mm
-    bias_y: float
-    fix_std: float  # mm
-    encoder_std: float  # rad
-    quantum: float  # rad
-    gain_l: float
-    gain_r: float
-
-
 class PatchRow(NamedTuple):
     """A patch as the compiled law takes it."""
 
@@ -171,9 +156,6 @@ class PatchRow(NamedTuple):
     scale: float
 
 
-read_effects = reader(Effects)
-
-
 def leveled(nominal: float, value: float, level: float) -> float:
     """A channel's value with the level on its deviation from nominal."""
     return nominal + level * (value - nominal)
@@ -181,11 +163,12 @@ def leveled(nominal: float, value: float, level: float) -> float:
 
 def signal_rows(disturbance: Disturbance, dt_s: float, control_period_s: float) -> np.ndarray:
     """The compiled signals, (channel, :class:`~tlf_env.disturbances.signals.SignalRow`)."""
-    periods = [dt_s] * SUBSTEP_CHANNELS + [control_period_s] * (len(PATHS) - SUBSTEP_CHANNELS)
     return np.array(
         [
-            disturbance.signal(channel.path).row(dt_s, period, channel.nominal)
-            for channel, period in zip(CHANNELS, periods, strict=True)
+            disturbance.signal(channel.path).row(
+                dt_s, dt_s if channel.rate == SUBSTEP else control_period_s, channel.nominal
+            )
+            for channel in CHANNELS
         ]
     )
 
@@ -201,7 +184,7 @@ def patch_rows(disturbance: Disturbance) -> np.ndarray:
 
 def changes_within_episode(disturbance: Disturbance) -> bool:
     """Whether a channel of every substep varies while an episode runs."""
-    return not all(disturbance.signal(path).is_steady() for path in PATHS[:SUBSTEP_CHANNELS])
+    return not all(disturbance.signal(PATHS[i]).is_steady() for i in numbers(SUBSTEP))
 
 
 @law

@@ -11,11 +11,11 @@ from typing import Any
 
 import numpy as np
 
-from tlf_env.engine import drivers, judging
+from tlf_env.engine import drivers, judging, readout
+from tlf_env.engine.arrays import Arrays, make_arrays, make_variants
 from tlf_env.engine.excerpt import Excerpt, empty_excerpt
-from tlf_env.engine.formation import NO_POSES, reference_table, refusal, state_rows
-from tlf_env.engine.layout import Arrays, make_arrays, make_variants
-from tlf_env.engine.settings import settings
+from tlf_env.engine.formation import NO_POSES, reference_table, refusal
+from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import STARTED
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import real_numbers
@@ -73,7 +73,7 @@ class BatchPlant:
         table = reference_table(self.scenario)
         self.arrays: Arrays = make_arrays(self.scenarios, table, self.formations)
         self._variants = make_variants(self.scenarios, _shares(mixture, len(self.scenarios)))
-        each = [settings(one) for one in self.scenarios]
+        each = [make_settings(one) for one in self.scenarios]
         self._settings = each[0]._replace(changing=any(one.changing for one in each))
         self._seeded = np.zeros(self.formations, dtype=np.bool_)
         self._nothing = empty_excerpt(self.arrays, 0, 0)
@@ -103,16 +103,16 @@ class BatchPlant:
             for a seed out of its range, a mask of another shape, or a formation that cannot start; in
             the last case the formations of the mask have to be reset again.
         """
-        a = self.arrays
+        arrays = self.arrays
         chosen = self._checked_mask(mask)
         fresh = chosen & ~self._seeded if seed is None else chosen
         if fresh.any():
             if seed is None:
                 seed = secrets.randbelow(MAX_SEED - self.formations)
             seeds = self._checked_seeds(seed)
-            a.seeds[fresh] = seeds[fresh]
-        a.clock[chosen & ~fresh, 2] += 1
-        a.clock[fresh, 2] = 0
+            arrays.seeds[fresh] = seeds[fresh]
+        arrays.clock[chosen & ~fresh, 2] += 1
+        arrays.clock[fresh, 2] = 0
         self._seeded |= chosen
         self._start(chosen)
 
@@ -121,12 +121,14 @@ class BatchPlant:
         self._start(self._checked_mask(mask))
 
     def _start(self, chosen: np.ndarray) -> None:
-        a = self.arrays
-        result, robot, lane = drivers.start(a, self._variants, chosen, NO_POSES, self._settings)
+        arrays = self.arrays
+        result, robot, lane = drivers.start(
+            arrays, self._variants, chosen, NO_POSES, self._settings
+        )
         if result != STARTED:
-            why = refusal(a, self._variants, result, robot, lane)
+            why = refusal(arrays, self._variants, result, robot, lane)
             raise ValueError(f"formation {lane}: {why}")
-        drivers.look(a, chosen, True, self._settings)
+        drivers.look(arrays, chosen, True, self._settings)
 
     def excerpt(self, robot: int) -> Excerpt:
         """Room for what there is to tell of one robot in each formation, not yet written."""
@@ -162,27 +164,29 @@ class BatchPlant:
         RuntimeError
             if a formation was never reset, or is at its horizon.
         """
-        a, s = self.arrays, self._settings
+        arrays, settings = self.arrays, self._settings
         given = real_numbers(actions)
         if given is None:
             raise ValueError(
-                f"actions must be real numbers in the shape {a.actions.shape}, got "
+                f"actions must be real numbers in the shape {arrays.actions.shape}, got "
                 f"{' '.join(repr(actions).split()):.60}"
             )
-        if given.shape != a.actions.shape:
-            raise ValueError(f"actions must have the shape {a.actions.shape}, got {given.shape}")
-        if not np.isfinite(given).all():
-            lane, r, _ = np.argwhere(~np.isfinite(given))[0]
+        if given.shape != arrays.actions.shape:
             raise ValueError(
-                f"formation {lane}, robot_{r}: the action must be finite, got {given[lane, r].tolist()}"
+                f"actions must have the shape {arrays.actions.shape}, got {given.shape}"
             )
-        if not self._seeded.all() or (a.clock[:, 1] >= s.horizon).any():
-            over = np.flatnonzero(~self._seeded | (a.clock[:, 1] >= s.horizon))
+        if not np.isfinite(given).all():
+            lane, robot, _ = np.argwhere(~np.isfinite(given))[0]
+            raise ValueError(
+                f"formation {lane}, robot_{robot}: the action must be finite, got {given[lane, robot].tolist()}"
+            )
+        if not self._seeded.all() or (arrays.clock[:, 1] >= settings.horizon).any():
+            over = np.flatnonzero(~self._seeded | (arrays.clock[:, 1] >= settings.horizon))
             raise RuntimeError(f"formation {over[0]}: call reset() before step()")
-        a.actions[:] = given
+        arrays.actions[:] = given
         threads = min(self.threads, -(-self.formations // drivers.LANES_AT_ONCE))
         left = drivers.lanes_to_step(0, self.formations, threads)
-        work = (a, left, self._nothing if excerpt is None else excerpt, s)
+        work = (arrays, left, self._nothing if excerpt is None else excerpt, settings)
         helpers = [self._others().submit(drivers.control_step, *work) for _ in range(threads - 1)]
         drivers.control_step(*work)
         for helper in helpers:
@@ -197,9 +201,9 @@ class BatchPlant:
     @property
     def observations(self) -> np.ndarray:
         """(formations, robots, entries)."""
-        a = self.arrays
+        arrays = self.arrays
         sensor = self.scenario.observation == "sensor"
-        return a.sensor_observations if sensor else a.observations
+        return arrays.sensor_observations if sensor else arrays.observations
 
     @property
     def rewards(self) -> np.ndarray:
@@ -210,6 +214,10 @@ class BatchPlant:
     def terms(self) -> np.ndarray:
         """Reward terms, (formations, robots, :class:`~tlf_env.task.reward.RewardTerms`)."""
         return self.arrays.terms
+
+    def named(self, name: str) -> Any:
+        """A row of the engine's table by name: its named tuple of arrays ``(formations, robots)``; views."""
+        return readout.named(self.arrays, name)
 
     @property
     def infos(self) -> np.ndarray:
@@ -283,7 +291,7 @@ class BatchPlant:
 
     def state(self) -> np.ndarray:
         """The truth, (formations, robots, :class:`~tlf_env.engine.layout.State`), in physical units."""
-        return state_rows(self.arrays)
+        return readout.state_rows(self.arrays)
 
     @property
     def memory_per_formation_bytes(self) -> int:

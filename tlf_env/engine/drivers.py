@@ -10,7 +10,16 @@ from __future__ import annotations
 
 import numpy as np
 
-from tlf_env.disturbances.channels import STEP_CHANNELS, SUBSTEP_CHANNELS
+from tlf_env.engine.arrays import (
+    Arrays,
+    Variants,
+    read_body,
+    read_wanted,
+    write_command,
+    write_wanted,
+    write_wanted_before,
+)
+from tlf_env.engine.effects import OF_STEPS, OF_SUBSTEPS, delays, evaluate, refresh
 from tlf_env.engine.excerpt import Excerpt, write_excerpt
 from tlf_env.engine.judging import (
     CLIPPED,
@@ -20,17 +29,15 @@ from tlf_env.engine.judging import (
     observe_sensors,
     record_truth,
 )
-from tlf_env.engine.layout import Arrays, Variants
+from tlf_env.engine.layout import Trace, WheelPair, in_array
 from tlf_env.engine.outlines import mark_touched, room_to_move
 from tlf_env.engine.radio import broadcast, delayed_message, next_reference
 from tlf_env.engine.settings import Settings
-from tlf_env.engine.starting import STARTED, fill, start_lane
-from tlf_env.engine.substeps import delays, evaluate, refresh
+from tlf_env.engine.starting import STARTED, clear, start_lane
 from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import block, driver, fetch_add, law
 from tlf_env.onboard.observer import Message
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
-from tlf_env.physics.state import read_body
 from tlf_env.task.actions import (
     FULL_RESIDUAL_MM_S,
     FULL_RESIDUAL_RAD_S,
@@ -48,143 +55,154 @@ from tlf_env.task.actions import (
 )
 from tlf_env.task.info import RUNNING
 
+TRACE = in_array("trace")
+TRACE_END = TRACE + len(Trace._fields)
 DONE, MUST_COLLIDE, MUST_SUBSTEP = -1, -2, -3
 LANES_AT_ONCE = 16  # whose arrays stay in the processor's cache during a step
 SHARES = 4  # of what is left, divided by the threads: how much a thread takes at a time
 
 
 @law
-def command(a: Arrays, lane: int, r: int, s: Settings) -> tuple[float, float]:
+def command(arrays: Arrays, lane: int, robot: int, settings: Settings) -> tuple[float, float]:
     """What robot ``r``'s clipped action asks for: wheel speeds (rad/s), or torques (mN·mm)."""
-    a_0, a_1 = a.actions[lane, r, 0], a.actions[lane, r, 1]
-    kind = a.kinds[r, lane]
+    a_0, a_1 = arrays.actions[lane, robot, 0], arrays.actions[lane, robot, 1]
+    kind = arrays.kinds[robot, lane]
     if kind == TORQUE:
         full = FULL_TORQUE_NMM * MILLINEWTON_PER_NEWTON
         return a_0 * full, a_1 * full
-    body = read_body(a.bodies, r, lane)
+    body = read_body(arrays.constants, robot, lane)
     if kind == RESIDUAL:
-        seen, given = a.observations[lane, r], a.twists[lane, r]
-        u_1, u_2 = wanted_twist(seen, a.scales, s.base)
-        share = residual_share(seen, a.scales, s.residual_fade, s.residual_reach)
+        seen, given = arrays.observations[lane, robot], arrays.twists[lane, robot]
+        u_1, u_2 = wanted_twist(seen, arrays.scales, settings.base)
+        share = residual_share(seen, arrays.scales, settings.residual_fade, settings.residual_reach)
         u_1 += share * a_0 * FULL_RESIDUAL_MM_S
         u_2 += share * a_1 * FULL_RESIDUAL_RAD_S
-        given[0], given[1] = twist_action(seen, a.scales, s.base, u_1, u_2)
+        given[0], given[1] = twist_action(seen, arrays.scales, settings.base, u_1, u_2)
         return wheel_command(given[0], given[1], TWIST, body)
     return wheel_command(a_0, a_1, kind, body)
 
 
 @block
-def first_bad_action(a: Arrays, first: int, last: int) -> int:
+def first_bad_action(arrays: Arrays, first: int, last: int) -> int:
     """``DONE``, or lane · robots + robot of the first action that is not finite."""
-    robots = a.actions.shape[1]
+    robots = arrays.actions.shape[1]
     for lane in range(first, last):
-        for r in range(robots):
-            if not (np.isfinite(a.actions[lane, r, 0]) and np.isfinite(a.actions[lane, r, 1])):
-                return lane * robots + r
+        for robot in range(robots):
+            if not (
+                np.isfinite(arrays.actions[lane, robot, 0])
+                and np.isfinite(arrays.actions[lane, robot, 1])
+            ):
+                return lane * robots + robot
     return DONE
 
 
 @law
-def take_actions(a: Arrays, lane: int, s: Settings) -> None:
+def take_actions(arrays: Arrays, lane: int, settings: Settings) -> None:
     """Clip the actions of a lane and turn them into commands; clears the traces."""
-    for r in range(a.actions.shape[1]):
-        if a.kinds[r, lane] == REFERENCE:
-            given = a.twists[lane, r]
-            given[0], given[1] = reference_action(a.observations[lane, r], a.scales, s.base)
-            a.actions[lane, r, 0], a.actions[lane, r, 1] = given[0], given[1]
-        a_0, a_1 = limited(a.actions[lane, r, 0]), limited(a.actions[lane, r, 1])
-        clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]
+    for robot in range(arrays.actions.shape[1]):
+        if arrays.kinds[robot, lane] == REFERENCE:
+            given = arrays.twists[lane, robot]
+            given[0], given[1] = reference_action(
+                arrays.observations[lane, robot], arrays.scales, settings.base
+            )
+            arrays.actions[lane, robot, 0], arrays.actions[lane, robot, 1] = given[0], given[1]
+        a_0, a_1 = limited(arrays.actions[lane, robot, 0]), limited(arrays.actions[lane, robot, 1])
+        clipped = a_0 != arrays.actions[lane, robot, 0] or a_1 != arrays.actions[lane, robot, 1]
         if clipped:
-            a.infos[lane, r, CLIPPED] += 1.0
-        a.actions[lane, r, 0], a.actions[lane, r, 1] = a_0, a_1
-        a.wanted_before[0, r, lane] = a.wanted[0, r, lane]
-        a.wanted_before[1, r, lane] = a.wanted[1, r, lane]
-        a.wanted[0, r, lane], a.wanted[1, r, lane] = command(a, lane, r, s)
-        a.commands[0, r, lane] = a.wanted[0, r, lane]
-        a.commands[1, r, lane] = a.wanted[1, r, lane]
-        tick = a.clock[lane, 0]
-        refresh(a, lane, r, SUBSTEP_CHANNELS, STEP_CHANNELS, tick, s.substeps, s)
-        if s.adversary and not s.changing:
-            evaluate(a, lane, r, 0, SUBSTEP_CHANNELS, tick, s)
-        a.lost_now[lane, r] = a.touched_now[lane, r] = False
-    fill(a.traces, lane, 0.0)
+            arrays.infos[lane, robot, CLIPPED] += 1.0
+        arrays.actions[lane, robot, 0], arrays.actions[lane, robot, 1] = a_0, a_1
+        write_wanted_before(arrays.states, robot, lane, read_wanted(arrays.states, robot, lane))
+        wanted_l, wanted_r = command(arrays, lane, robot, settings)
+        write_wanted(arrays.states, robot, lane, WheelPair(wanted_l, wanted_r))
+        write_command(arrays.states, robot, lane, WheelPair(wanted_l, wanted_r))
+        tick = arrays.clock[lane, 0]
+        refresh(arrays, lane, robot, OF_STEPS, tick, settings.substeps, settings)
+        if settings.adversary and not settings.changing:
+            for i in range(OF_SUBSTEPS.shape[0]):
+                evaluate(arrays, lane, robot, OF_SUBSTEPS[i], tick, settings)
+        arrays.lost_now[lane, robot] = arrays.touched_now[lane, robot] = False
+    clear(arrays.states, lane, TRACE, TRACE_END)
 
 
 @block
-def take_all_actions(a: Arrays, first: int, last: int, s: Settings) -> None:
+def take_all_actions(arrays: Arrays, first: int, last: int, settings: Settings) -> None:
     """:func:`take_actions` of the lanes from ``first`` to before ``last``."""
     for lane in range(first, last):
-        take_actions(a, lane, s)
+        take_actions(arrays, lane, settings)
 
 
 @law
-def transmit_lane(a: Arrays, lane: int, s: Settings) -> None:
+def transmit_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
     """Count the control step; everybody broadcasts."""
-    step = a.clock[lane, 1] + 1
-    a.clock[lane, 1] = step
-    for r in range(a.motions.shape[1]):
-        broadcast(a, lane, r, step, s)
-        record_truth(a, lane, r, step)
+    step = arrays.clock[lane, 1] + 1
+    arrays.clock[lane, 1] = step
+    for robot in range(arrays.states.shape[1]):
+        broadcast(arrays, lane, robot, step, settings)
+        record_truth(arrays, lane, robot, step)
 
 
 @law
-def look_lane(a: Arrays, lane: int, s: Settings) -> None:
+def look_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
     """Errors, rewards and observations of a lane as it stands."""
-    robots = a.motions.shape[1]
-    step = a.clock[lane, 1]
-    for r in range(robots):
-        judge_robot(a, lane, r, step, s)
-        observe_robot(a, lane, r, step, s)
-        if a.sensor_observations.shape[2] > 0:
-            observe_sensors(a, lane, r, step, s)
-    if s.cooperative:
+    robots = arrays.states.shape[1]
+    step = arrays.clock[lane, 1]
+    for robot in range(robots):
+        judge_robot(arrays, lane, robot, step, settings)
+        observe_robot(arrays, lane, robot, step, settings)
+        if arrays.sensor_observations.shape[2] > 0:
+            observe_sensors(arrays, lane, robot, step, settings)
+    if settings.cooperative:
         total = 0.0
-        for r in range(robots):
-            total += a.rewards[lane, r]
-        for r in range(robots):
-            a.rewards[lane, r] = total / robots
-    end_lane(a, lane, s)
+        for robot in range(robots):
+            total += arrays.rewards[lane, robot]
+        for robot in range(robots):
+            arrays.rewards[lane, robot] = total / robots
+    end_lane(arrays, lane, settings)
 
 
 @block
-def transmit_all(a: Arrays, first: int, last: int, s: Settings) -> None:
+def transmit_all(arrays: Arrays, first: int, last: int, settings: Settings) -> None:
     """:func:`transmit_lane` of the lanes from ``first`` to before ``last``, and their next references."""
     for lane in range(first, last):
-        transmit_lane(a, lane, s)
-        for r in range(a.motions.shape[1]):
-            next_reference(a, lane, r, a.clock[lane, 1] + s.lookahead, s)
+        transmit_lane(arrays, lane, settings)
+        for robot in range(arrays.states.shape[1]):
+            next_reference(
+                arrays, lane, robot, arrays.clock[lane, 1] + settings.lookahead, settings
+            )
 
 
 @block
-def look_all(a: Arrays, first: int, last: int, s: Settings) -> None:
+def look_all(arrays: Arrays, first: int, last: int, settings: Settings) -> None:
     """:func:`look_lane` of the lanes from ``first`` to before ``last``."""
     for lane in range(first, last):
-        look_lane(a, lane, s)
+        look_lane(arrays, lane, settings)
 
 
 @driver
-def excerpt_of(a: Arrays, mask: np.ndarray, out: Excerpt) -> None:
+def excerpt_of(arrays: Arrays, mask: np.ndarray, out: Excerpt) -> None:
     """Write the excerpt of the lanes of the mask."""
     for lane in range(mask.shape[0]):
         if mask[lane]:
-            write_excerpt(a, lane, lane + 1, out)
+            write_excerpt(arrays, lane, lane + 1, out)
 
 
 @driver
-def delayed_message_of(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
+def delayed_message_of(
+    arrays: Arrays, lane: int, robot: int, step: int, settings: Settings
+) -> Message:
     """:func:`delayed_message`, for observers outside."""
-    return delayed_message(a, lane, r, step, s)
+    return delayed_message(arrays, lane, robot, step, settings)
 
 
 @driver
-def delays_of(a: Arrays, lane: int, r: int, dt: float) -> tuple[int, int]:
+def delays_of(arrays: Arrays, lane: int, robot: int, dt: float) -> tuple[int, int]:
     """:func:`delays`, for wheel loops outside."""
-    return delays(a, lane, r, dt)
+    return delays(arrays, lane, robot, dt)
 
 
 @driver
 def start(
-    a: Arrays, of: Variants, mask: np.ndarray, poses: np.ndarray, s: Settings
+    arrays: Arrays, of: Variants, mask: np.ndarray, poses: np.ndarray, settings: Settings
 ) -> tuple[int, int, int]:
     """:func:`start_lane` of every lane of the mask, up to the first that fails; :func:`look` is next.
 
@@ -192,65 +210,67 @@ def start(
     """
     for lane in range(mask.shape[0]):
         if mask[lane]:
-            result, robot = start_lane(a, of, lane, poses, s)
+            result, robot = start_lane(arrays, of, lane, poses, settings)
             if result != STARTED:
                 return result, robot, lane
     return STARTED, 0, 0
 
 
 @driver
-def look(a: Arrays, mask: np.ndarray, at_start: bool, s: Settings) -> None:
+def look(arrays: Arrays, mask: np.ndarray, at_start: bool, settings: Settings) -> None:
     """:func:`look_lane` of the lanes of the mask; who starts lost is lost in the first step."""
     for lane in range(mask.shape[0]):
         if mask[lane]:
-            look_all(a, lane, lane + 1, s)
+            look_all(arrays, lane, lane + 1, settings)
             if at_start:
-                for r in range(a.ends.shape[1]):
-                    a.lost[lane, r] = a.lost_now[lane, r] = False
-                    a.ends[lane, r] = RUNNING
+                for robot in range(arrays.ends.shape[1]):
+                    arrays.lost[lane, robot] = arrays.lost_now[lane, robot] = False
+                    arrays.ends[lane, robot] = RUNNING
 
 
 @driver
-def transmit(a: Arrays, lane: int, s: Settings) -> None:
+def transmit(arrays: Arrays, lane: int, settings: Settings) -> None:
     """:func:`transmit_lane`."""
-    transmit_lane(a, lane, s)
+    transmit_lane(arrays, lane, settings)
 
 
 @driver
-def refer(a: Arrays, lane: int, first: int, last: int, s: Settings) -> None:
+def refer(arrays: Arrays, lane: int, first: int, last: int, settings: Settings) -> None:
     """The next references of the robots from ``first`` to before ``last``."""
-    for r in range(first, last):
-        next_reference(a, lane, r, a.clock[lane, 1] + s.lookahead, s)
+    for robot in range(first, last):
+        next_reference(arrays, lane, robot, arrays.clock[lane, 1] + settings.lookahead, settings)
 
 
 @block
-def find_near(a: Arrays, first: int, last: int, near: np.ndarray, s: Settings) -> None:
+def find_near(arrays: Arrays, first: int, last: int, near: np.ndarray, settings: Settings) -> None:
     """Mark the lanes from ``first`` on whose outlines could meet within the control step.
 
     Without torques only its end counts.
     """
     for lane in range(first, last):
-        near[lane - first] = not s.kinematic and not room_to_move(a, lane, s.period)
+        near[lane - first] = not settings.kinematic and not room_to_move(
+            arrays, lane, settings.period
+        )
 
 
 @driver
-def actuate(a: Arrays, lane: int, k: int, s: Settings) -> None:
+def actuate(arrays: Arrays, lane: int, substep: int, settings: Settings) -> None:
     """The first half of substep ``k`` of a lane: everything up to the plant's new velocities and poses."""
-    advance(a, np.full(1, lane), k, k + 1, True, False, s)
+    advance(arrays, np.full(1, lane), substep, substep + 1, True, False, settings)
 
 
 @driver
-def sense(a: Arrays, lane: int, k: int, s: Settings) -> None:
+def sense(arrays: Arrays, lane: int, substep: int, settings: Settings) -> None:
     """The second half of substep ``k`` of a lane: sensors and estimator, and which outlines meet."""
-    advance(a, np.full(1, lane), k, k + 1, False, True, s)
-    mark_touched(a, lane)
+    advance(arrays, np.full(1, lane), substep, substep + 1, False, True, settings)
+    mark_touched(arrays, lane)
 
 
 @block
-def mark_all_touched(a: Arrays, lanes: np.ndarray) -> None:
+def mark_all_touched(arrays: Arrays, lanes: np.ndarray) -> None:
     """:func:`mark_touched` of some lanes."""
     for i in range(lanes.shape[0]):
-        mark_touched(a, lanes[i])
+        mark_touched(arrays, lanes[i])
 
 
 def lanes_to_step(first: int, last: int, threads: int = 1) -> np.ndarray:
@@ -268,7 +288,7 @@ def take_lanes(left: np.ndarray) -> tuple[int, int]:
 
 
 @driver
-def control_step(a: Arrays, left: np.ndarray, out: Excerpt, s: Settings) -> int:
+def control_step(arrays: Arrays, left: np.ndarray, out: Excerpt, settings: Settings) -> int:
     """A whole control step of lanes (see :func:`lanes_to_step`) until none is left, and their excerpt.
 
     Returns ``DONE``; or the number of the first robot whose action is not finite (see
@@ -281,35 +301,35 @@ def control_step(a: Arrays, left: np.ndarray, out: Excerpt, s: Settings) -> int:
     near = np.empty(LANES_AT_ONCE, dtype=np.bool_)
     first, last = take_lanes(left)
     while first < last:
-        bad = first_bad_action(a, first, last)
+        bad = first_bad_action(arrays, first, last)
         if bad != DONE:
             return bad
         for begin in range(first, last, LANES_AT_ONCE):
             end = min(begin + LANES_AT_ONCE, last)
-            take_all_actions(a, begin, end, s)
-            find_near(a, begin, end, near, s)
+            take_all_actions(arrays, begin, end, settings)
+            find_near(arrays, begin, end, near, settings)
             apart = close = 0
             for lane in range(begin, end):
-                if near[lane - begin] and s.collides:
+                if near[lane - begin] and settings.collides:
                     return MUST_COLLIDE
-                if s.has_parts:
+                if settings.has_parts:
                     return MUST_SUBSTEP
                 if near[lane - begin]:
                     close_lanes[close], close = lane, close + 1
                 else:
                     apart_lanes[apart], apart = lane, apart + 1
             lanes = apart_lanes[:apart]
-            advance(a, lanes, 0, s.substeps, True, True, s)
-            if s.kinematic:
-                mark_all_touched(a, lanes)
+            advance(arrays, lanes, 0, settings.substeps, True, True, settings)
+            if settings.kinematic:
+                mark_all_touched(arrays, lanes)
             # Robots pass through each other here. While they are close, each substep asks which
             # outlines meet, so that the first touch is marked where a plant with contact marks it.
             lanes = close_lanes[:close]
-            for k in range(s.substeps if close > 0 else 0):
-                advance(a, lanes, k, k + 1, True, True, s)
-                mark_all_touched(a, lanes)
-            transmit_all(a, begin, end, s)
-            look_all(a, begin, end, s)
-            write_excerpt(a, begin, end, out)
+            for substep in range(settings.substeps if close > 0 else 0):
+                advance(arrays, lanes, substep, substep + 1, True, True, settings)
+                mark_all_touched(arrays, lanes)
+            transmit_all(arrays, begin, end, settings)
+            look_all(arrays, begin, end, settings)
+            write_excerpt(arrays, begin, end, out)
         first, last = take_lanes(left)
     return DONE

@@ -3,29 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
 import pymunk
 
 from tlf_env.disturbances.channels import (
     CHANNELS,
-    PATHS,
     PAYLOAD_BEHIND,
     PAYLOAD_MASS,
+    SET_WITHIN_EPISODE,
     START_POSITION,
-    STEP_CHANNELS,
+    number,
 )
-from tlf_env.engine import drivers
+from tlf_env.engine import drivers, readout
+from tlf_env.engine.arrays import Arrays, Variants, make_arrays, make_variants
 from tlf_env.engine.excerpt import empty_excerpt
-from tlf_env.engine.judging import BODY_D
-from tlf_env.engine.layout import Arrays, Variants, make_arrays, make_variants
+from tlf_env.engine.layout import rows_of
 from tlf_env.engine.outside_parts import Parts, part_factories
-from tlf_env.engine.settings import settings
+from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import OFF_BASE, START_ATTEMPTS, STARTED
+from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.parts import Factory
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.pymunk_plant import PymunkPlant
-from tlf_env.physics.state import Motion
+from tlf_env.task.info import Info
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.trajectories import sample
 
@@ -61,7 +63,7 @@ class Formation:
         self._variants = make_variants([scenario])
         self.plant = PymunkPlant(list(scenario.robot_models))
         self._parts = Parts(part_factories(scenario, parts or {}), scenario)
-        self._settings = settings(scenario)
+        self._settings = make_settings(scenario)
         self._left = drivers.lanes_to_step(0, 1)
         self._nothing = empty_excerpt(self.arrays, 0, 0)
 
@@ -78,7 +80,7 @@ class Formation:
     @property
     def space(self) -> pymunk.Space:
         """The pymunk space with the bodies where they are now."""
-        return self.plant.space(self.arrays.motions)
+        return self.plant.space(self.arrays.rows("motion"))
 
     def reset(
         self,
@@ -92,17 +94,17 @@ class Formation:
         ``poses`` ``(robot, 3)`` (mm, mm, rad) replaces the start poses of c; ``phase_s`` starts the
         leader's reference that much later on its trajectory.
         """
-        a, s = self.arrays, self._settings
-        a.clock[0], a.seeds[0] = (0, 0, episode), seed
-        a.table[:] = reference_table(self.scenario, phase_s) if phase_s else self._table
-        result, r, _ = drivers.start(
-            a, self._variants, ALONE, NO_POSES if poses is None else poses, s
+        arrays, settings = self.arrays, self._settings
+        arrays.clock[0], arrays.seeds[0] = (0, 0, episode), seed
+        arrays.table[:] = reference_table(self.scenario, phase_s) if phase_s else self._table
+        result, robot, _ = drivers.start(
+            arrays, self._variants, ALONE, NO_POSES if poses is None else poses, settings
         )
         if result != STARTED:
-            raise ValueError(refusal(a, self._variants, result, r))
-        self.plant.reset(a.bodies[:, :, 0])
-        self._parts.reset(a, s)
-        drivers.look(a, ALONE, True, s)
+            raise ValueError(refusal(arrays, self._variants, result, robot))
+        self.plant.reset(arrays.rows("body")[:, :, 0])
+        self._parts.reset(arrays, settings)
+        drivers.look(arrays, ALONE, True, settings)
 
     def impose(self, values: Mapping[str, float | np.ndarray]) -> None:
         """Set channels for the coming control step: ``{path: value or one per robot}``.
@@ -112,19 +114,19 @@ class Formation:
         ValueError
             for an unknown channel, one that cannot change within an episode, or a value out of range.
         """
-        a, robots = self.arrays, self.scenario.robot_count
+        arrays, robots = self.arrays, self.scenario.robot_count
         if not self.scenario.adversary:
             raise ValueError(
                 "channels can be set within an episode only if the scenario has adversary: true"
             )
-        a.imposed[:] = np.nan
+        arrays.imposed[:] = np.nan
         for path, value in values.items():
-            if path not in PATHS[:STEP_CHANNELS]:
+            if path not in SET_WITHIN_EPISODE:
                 raise ValueError(
                     f"channel {path!r} cannot be set within an episode; there are "
-                    f"{', '.join(PATHS[:STEP_CHANNELS])}"
+                    f"{', '.join(SET_WITHIN_EPISODE)}"
                 )
-            channel = CHANNELS[PATHS.index(path)]
+            channel = CHANNELS[number(path)]
             high = channel.high
             if path == "actuator.computing_delay_s":
                 high = min(high, self.scenario.control_period_s)
@@ -137,7 +139,7 @@ class Formation:
                 raise ValueError(
                     f"{path} {value!r} is out of its range, {channel.low:g} to {high:g}"
                 )
-            a.imposed[PATHS.index(path), :, 0] = row
+            arrays.imposed[number(path), :, 0] = row
 
     def applied(self) -> np.ndarray:
         """The channels' last values, (robot, channel), channels as in ``PATHS``."""
@@ -151,73 +153,74 @@ class Formation:
         ValueError
             for an action that is not finite, naming the robot; then nothing has changed.
         """
-        a, s = self.arrays, self._settings
+        arrays, settings = self.arrays, self._settings
         self._left[0] = 0
-        result = drivers.control_step(a, self._left, self._nothing, s)
+        result = drivers.control_step(arrays, self._left, self._nothing, settings)
         if result == drivers.DONE:
             return
         if result >= 0:
             raise ValueError(
-                f"robot_{result}: the action must be finite, got {a.actions[0, result].tolist()}"
+                f"robot_{result}: the action must be finite, got {arrays.actions[0, result].tolist()}"
             )
         self._substep_by_substep(close=result == drivers.MUST_COLLIDE)
-        drivers.transmit(a, 0, s)
-        drivers.refer(a, 0, 0, 1 if s.external_observer else self.scenario.robot_count, s)
-        if s.external_observer:
-            self._parts.observe(a, s)
-        drivers.look(a, ALONE, False, s)
+        drivers.transmit(arrays, 0, settings)
+        drivers.refer(
+            arrays, 0, 0, 1 if settings.external_observer else self.scenario.robot_count, settings
+        )
+        if settings.external_observer:
+            self._parts.observe(arrays, settings)
+        drivers.look(arrays, ALONE, False, settings)
 
     def _substep_by_substep(self, close: bool) -> None:
-        a, s = self.arrays, self._settings
-        for k in range(s.substeps):
-            self._parts.drive(a, k, s)
-            before = a.motions.copy() if close else a.motions
-            drivers.actuate(a, 0, k, s)
+        arrays, settings = self.arrays, self._settings
+        motion = arrays.rows("motion")
+        for substep in range(settings.substeps):
+            self._parts.drive(arrays, substep, settings)
+            before = motion.copy() if close else motion
+            drivers.actuate(arrays, 0, substep, settings)
             if close:
-                self.plant.collide(before, a.motions, s.dt)
-            drivers.sense(a, 0, k, s)
-            self._parts.estimate(a, k)
+                self.plant.collide(before, motion, settings.dt)
+            drivers.sense(arrays, 0, substep, settings)
+            self._parts.estimate(arrays, substep)
 
     def state(self) -> np.ndarray:
-        """The truth, (robot, :class:`State`), in physical units."""
-        return state_rows(self.arrays)[0]
+        """The true state, (robot, :class:`~tlf_env.task.info.State`), in physical units."""
+        return readout.state_rows(self.arrays)[0]
+
+    def named(self, name: str) -> Any:
+        """A row of the engine's table by name: its named tuple of arrays ``(robot,)``; views."""
+        row = readout.named(self.arrays, name)
+        return type(row)(*(field[0] for field in row))
+
+    def info(self) -> Any:
+        """:class:`~tlf_env.task.info.Info` of the last step, each field ``(robot,)``; views."""
+        return Info(*(field[0] for field in readout.info(self.arrays)))
+
+    def reference(self) -> Any:
+        """:class:`~tlf_env.onboard.observer.Reference` of every robot now, each field ``(robot,)``."""
+        return Reference(*(field[0] for field in readout.reference(self.arrays)))
+
+    def true_positions(self, step: int) -> np.ndarray:
+        """True position of c at a control step of the last gap, ``(2, robot)``, mm; a view."""
+        return readout.true_positions(self.arrays, step)[:, 0]
+
+    def leader_path(self) -> np.ndarray:
+        """The leader's whole reference path, ``(step, 2)``, mm; a view."""
+        return self.arrays.table[:, :2]
 
 
-def refusal(a: Arrays, of: Variants, result: int, r: int, lane: int = 0) -> str:
+def refusal(arrays: Arrays, of: Variants, result: int, robot: int, lane: int = 0) -> str:
     """Why a lane could not start, in one line."""
     if result == OFF_BASE:
-        mass, behind = a.applied[PAYLOAD_MASS, r, lane], a.applied[PAYLOAD_BEHIND, r, lane]
-        laden, empty = Body(*a.bodies[:, r, lane]), Body(*of.bodies[:, r, a.variants[lane]])
+        mass = arrays.applied[PAYLOAD_MASS, robot, lane]
+        behind = arrays.applied[PAYLOAD_BEHIND, robot, lane]
+        laden = Body(*arrays.rows("body")[:, robot, lane])
+        empty = Body(*rows_of(of.constants, "body")[:, robot, arrays.variants[lane]])
         return (
             f"payload of {mass:g} kg at {behind:g} mm puts the centre of mass {laden.d:g} mm behind "
             f"the axle; the wheels carry it from 0 to {empty.pivot + empty.T:g} mm"
         )
     return (
-        f"robot_{r}: no start pose without overlap in {START_ATTEMPTS} draws with "
-        f"start.position_std_mm {a.applied[START_POSITION, r, lane]:g}; it leaves too little room"
+        f"robot_{robot}: no start pose without overlap in {START_ATTEMPTS} draws with "
+        f"start.position_std_mm {arrays.applied[START_POSITION, robot, lane]:g}; it leaves too little room"
     )
-
-
-def state_rows(a: Arrays) -> np.ndarray:
-    """True state, (lane, robot, :class:`State`), in physical units."""
-    lanes = a.clock.shape[0]
-    m = Motion(*a.motions[:, :, :lanes])
-    d = a.bodies[BODY_D, :, :lanes]
-    sin, cos = np.sin(m.theta), np.cos(m.theta)
-    slots = (a.clock[:, 1] % a.references.shape[1])[None, None, :]
-    x, y = np.take_along_axis(a.references[:2, :, :, :lanes], slots[None], axis=1)[:, 0]
-    rows = [
-        m.x - d * sin,
-        m.y + d * cos,
-        sin,
-        cos,
-        np.remainder(m.psi - m.theta + np.pi, 2 * np.pi) - np.pi,
-        -m.v_x * sin + m.v_y * cos,
-        m.v_x * cos + m.v_y * sin - m.w * d,
-        m.w,
-        m.omega_l,
-        m.omega_r,
-        x,
-        y,
-    ]
-    return np.stack(rows, axis=-1).transpose(1, 0, 2)

@@ -1,4 +1,4 @@
-"""What a robot sees and what is told of it: observations, true errors, reward terms."""
+"""What a step returns of a robot: observations, true errors, reward terms, and why an episode ended."""
 
 from __future__ import annotations
 
@@ -6,16 +6,26 @@ import math
 
 import numpy as np
 
-from tlf_env.engine.layout import Arrays, read_trace
-from tlf_env.engine.radio import DELTA_1, DELTA_2, delayed_message, latest_message, read_reference
+from tlf_env.engine.arrays import (
+    Arrays,
+    read_body,
+    read_estimate,
+    read_motion,
+    read_slip,
+    read_start,
+    read_trace,
+    read_wanted,
+)
+from tlf_env.engine.layout import in_array
+from tlf_env.engine.radio import delayed_message, latest_message, read_reference
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
-from tlf_env.onboard.estimator import odometry, read_estimate
+from tlf_env.onboard.estimator import odometry
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.tracking import body_errors
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Body
-from tlf_env.physics.state import axle_midpoint, read_body, read_motion
+from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.state import axle_midpoint
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.info import HORIZON, LOST, OTHER_ROBOT, RUNNING, TOUCHED, Info
 from tlf_env.task.measures import distance, time_gap_error
@@ -23,210 +33,230 @@ from tlf_env.task.observation import Preview, SensorTail, Tracking, preview_entr
 from tlf_env.task.reward import reward_terms
 
 CLIPPED = Info._fields.index("clipped")
-BODY_D = Body._fields.index("d")
+BODY_D = in_array("body", "d")
 
 
 @law
-def observe_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
+def observe_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> None:
     """Write the ``tracking`` observation of one robot."""
-    robots = a.motions.shape[1]
-    estimate = read_estimate(a.estimates, r, lane)
-    reference = read_reference(a, lane, r, step)
-    trace = read_trace(a.traces, r, lane)
+    robots = arrays.states.shape[1]
+    estimate = read_estimate(arrays.states, robot, lane)
+    reference = read_reference(arrays, lane, robot, step)
+    trace = read_trace(arrays.states, robot, lane)
     e_1, e_2 = body_errors(reference.x - estimate.x, reference.y - estimate.y, estimate.theta)
     e_3 = reference.theta - estimate.theta
     sin_e3, cos_e3 = math.sin(e_3), math.cos(e_3)
-    per_substep = 1.0 / s.substeps
+    per_substep = 1.0 / settings.substeps
     to_Nmm = per_substep / MILLINEWTON_PER_NEWTON
     command_1 = command_2 = 0.0
-    if a.kinds[r, lane] != TORQUE:
-        body = read_body(a.bodies, r, lane)
-        command_1, command_2 = odometry(a.wanted[0, r, lane], a.wanted[1, r, lane], body.R, body.h)
+    if arrays.kinds[robot, lane] != TORQUE:
+        body = read_body(arrays.constants, robot, lane)
+        wanted = read_wanted(arrays.states, robot, lane)
+        command_1, command_2 = odometry(wanted.left, wanted.right, body.R, body.h)
     before = Preview(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-    if r > 0:
-        heard = latest_message(a, lane, r, step, s)
+    if robot > 0:
+        heard = latest_message(arrays, lane, robot, step, settings)
         before = preview_entries(heard, estimate.x, estimate.y, estimate.theta)
-    row = Tracking(
-        e_1,
-        e_2,
-        sin_e3,
-        cos_e3,
-        e_1,
-        e_2,
-        sin_e3,
-        reference.u_1,
-        reference.u_2,
-        trace.distance / s.period,
-        trace.turn / s.period,
-        a.last_actions[lane, r, 0],
-        a.last_actions[lane, r, 1],
-        command_1,
-        command_2,
-        trace.innovation_forward * per_substep,
-        trace.innovation_right * per_substep,
-        a.slip_estimates[DELTA_1, r, lane],
-        a.slip_estimates[DELTA_2, r, lane],
-        trace.torque_l * to_Nmm,
-        trace.torque_r * to_Nmm,
-        1.0 if r == 0 else 0.0,
-        1.0 if r == robots - 1 else 0.0,
-        before.forward,
-        before.right,
-        before.sin_turn,
-        before.cos_turn,
-        before.u_1,
-        before.u_2,
+    slip = read_slip(arrays.states, robot, lane)
+    is_leader = 1.0 if robot == 0 else 0.0
+    is_last = 1.0 if robot == robots - 1 else 0.0
+    row = Tracking(  # Numba takes no conditional inside so many keywords
+        e_1=e_1,
+        e_2=e_2,
+        sin_e_3=sin_e3,
+        cos_e_3=cos_e3,
+        e_1_fine=e_1,
+        e_2_fine=e_2,
+        sin_e_3_fine=sin_e3,
+        reference_u_1=reference.u_1,
+        reference_u_2=reference.u_2,
+        odometry_u_1=trace.distance / settings.period,
+        odometry_u_2=trace.turn / settings.period,
+        last_action_0=arrays.last_actions[lane, robot, 0],
+        last_action_1=arrays.last_actions[lane, robot, 1],
+        command_u_1=command_1,
+        command_u_2=command_2,
+        innovation_forward=trace.innovation_forward * per_substep,
+        innovation_right=trace.innovation_right * per_substep,
+        slip_1=slip.delta_1,
+        slip_2=slip.delta_2,
+        torque_l=trace.torque_l * to_Nmm,
+        torque_r=trace.torque_r * to_Nmm,
+        is_leader=is_leader,
+        is_last=is_last,
+        predecessor_forward=before.forward,
+        predecessor_right=before.right,
+        predecessor_sin_turn=before.sin_turn,
+        predecessor_cos_turn=before.cos_turn,
+        predecessor_u_1=before.u_1,
+        predecessor_u_2=before.u_2,
     )
     entries = len(row)
     for i in range(entries):
-        a.observations[lane, r, i] = scaled(row[i], a.scales[i])
-    for p in range(a.previews.shape[0]):
-        later = read_reference(a, lane, r, step + a.previews[p])
+        arrays.observations[lane, robot, i] = scaled(row[i], arrays.scales[i])
+    for p in range(arrays.previews.shape[0]):
+        later = read_reference(arrays, lane, robot, step + arrays.previews[p])
         preview = preview_entries(later, estimate.x, estimate.y, estimate.theta)
         for i in range(len(preview)):
             j = entries + p * len(preview) + i
-            a.observations[lane, r, j] = scaled(preview[i], a.scales[j])
+            arrays.observations[lane, robot, j] = scaled(preview[i], arrays.scales[j])
 
 
 @law
-def observe_sensors(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
+def observe_sensors(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> None:
     """Write the ``sensor`` observation of one robot."""
-    out = a.sensor_observations[lane, r]
-    start_x, start_y, start = a.starts[0, r, lane], a.starts[1, r, lane], a.starts[2, r, lane]
+    out = arrays.sensor_observations[lane, robot]
+    start_x, start_y, start = read_start(arrays.states, robot, lane)
     i = 0
-    for k in range(s.substeps):
-        for f in range(a.samples.shape[1]):
-            value = a.samples[k, f, r, lane] if step > 0 else 0.0
+    for substep in range(settings.substeps):
+        for f in range(arrays.samples.shape[1]):
+            value = arrays.samples[substep, f, robot, lane] if step > 0 else 0.0
             if step > 0 and f == 0:
                 value -= start_x
             elif step > 0 and f == 1:
                 value -= start_y
-            out[i] = scaled(value, a.sensor_scales[i])
+            out[i] = scaled(value, arrays.sensor_scales[i])
             i += 1
-    if r == 0:
-        heard = read_reference(a, lane, r, step)
+    if robot == 0:
+        heard = read_reference(arrays, lane, robot, step)
     else:
-        delayed = delayed_message(a, lane, r, step, s)
+        delayed = delayed_message(arrays, lane, robot, step, settings)
         heard = Reference(delayed.x, delayed.y, delayed.theta, delayed.u_1, delayed.u_2)
     tail = SensorTail(
-        step * s.period,
-        start_x,
-        start_y,
-        math.sin(start),
-        math.cos(start),
-        heard.x - start_x,
-        heard.y - start_y,
-        math.sin(heard.theta),
-        math.cos(heard.theta),
-        heard.u_1,
-        heard.u_2,
-        1.0 if r == 0 else 0.0,
+        time=step * settings.period,
+        start_x=start_x,
+        start_y=start_y,
+        start_sin=math.sin(start),
+        start_cos=math.cos(start),
+        message_x=heard.x - start_x,
+        message_y=heard.y - start_y,
+        message_sin=math.sin(heard.theta),
+        message_cos=math.cos(heard.theta),
+        message_u_1=heard.u_1,
+        message_u_2=heard.u_2,
+        is_leader=1.0 if robot == 0 else 0.0,
     )
     for j in range(len(tail)):
-        out[i + j] = scaled(tail[j], a.sensor_scales[i + j])
+        out[i + j] = scaled(tail[j], arrays.sensor_scales[i + j])
 
 
 @law
-def wanted_of_formation(a: Arrays, lane: int, r: int, step: int, gap: int) -> tuple[float, float]:
-    """Where robot ``r`` belongs by the leader's reference, ref(t − r·gap), at rest before it starts; mm."""
-    k = max(step - r * gap, 0)
-    return a.table[k, 0], a.table[k, 1]
+def wanted_of_formation(
+    arrays: Arrays, lane: int, robot: int, step: int, gap: int
+) -> tuple[float, float]:
+    """A robot's place by the leader's reference, ref(t − robot·gap); ref(0) before the start; mm."""
+    substep = max(step - robot * gap, 0)
+    return arrays.table[substep, 0], arrays.table[substep, 1]
 
 
 @law
-def record_truth(a: Arrays, lane: int, r: int, step: int) -> None:
-    """Put the true place of robot ``r`` into the ring of paths."""
-    slot = step % a.paths.shape[1]
-    x, y = axle_midpoint(read_motion(a.motions, r, lane), a.bodies[BODY_D, r, lane])
-    a.paths[0, slot, r, lane], a.paths[1, slot, r, lane] = x, y
+def record_truth(arrays: Arrays, lane: int, robot: int, step: int) -> None:
+    """Put a robot's true position into the ring of paths."""
+    slot = step % arrays.paths.shape[1]
+    x, y = axle_midpoint(
+        read_motion(arrays.states, robot, lane), arrays.constants[BODY_D, robot, lane]
+    )
+    arrays.paths[0, slot, robot, lane], arrays.paths[1, slot, robot, lane] = x, y
     if step == 0:
-        a.longest[r, lane] = 0.0
+        arrays.longest[robot, lane] = 0.0
     else:
-        before = (step - 1) % a.paths.shape[1]
-        way = distance(x, y, a.paths[0, before, r, lane], a.paths[1, before, r, lane])
-        a.longest[r, lane] = max(a.longest[r, lane], way)
+        before = (step - 1) % arrays.paths.shape[1]
+        way = distance(
+            x, y, arrays.paths[0, before, robot, lane], arrays.paths[1, before, robot, lane]
+        )
+        arrays.longest[robot, lane] = max(arrays.longest[robot, lane], way)
 
 
 @law
-def judge_robot(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
+def judge_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> None:
     """Write the true errors, the reward terms and whether one robot is lost."""
-    motion = read_motion(a.motions, r, lane)
-    d = a.bodies[BODY_D, r, lane]
+    motion = read_motion(arrays.states, robot, lane)
+    d = arrays.constants[BODY_D, robot, lane]
     x, y = axle_midpoint(motion, d)
-    reference = read_reference(a, lane, r, step)
-    trace = read_trace(a.traces, r, lane)
+    reference = read_reference(arrays, lane, robot, step)
+    trace = read_trace(arrays.states, robot, lane)
     error = distance(x, y, reference.x, reference.y)
-    wanted_x, wanted_y = wanted_of_formation(a, lane, r, step, s.gap)
+    wanted_x, wanted_y = wanted_of_formation(arrays, lane, robot, step, settings.gap)
     late = 0.0
-    if r > 0:
-        path = a.paths[:, :, r - 1, lane]
-        late = time_gap_error(x, y, path, step, s.gap, s.window, s.period, a.longest[r - 1, lane])
-    to_Nmm = 1.0 / (s.substeps * MILLINEWTON_PER_NEWTON)
+    if robot > 0:
+        path = arrays.paths[:, :, robot - 1, lane]
+        late = time_gap_error(
+            x,
+            y,
+            path,
+            step,
+            settings.gap,
+            settings.window,
+            settings.period,
+            arrays.longest[robot - 1, lane],
+        )
+    to_Nmm = 1.0 / (settings.substeps * MILLINEWTON_PER_NEWTON)
     info = Info(
-        error,
-        distance(x, y, wanted_x, wanted_y),
-        wrap(reference.theta - motion.theta),
-        late,
-        trace.slip,
-        trace.torque_l * to_Nmm,
-        trace.torque_r * to_Nmm,
-        math.sqrt(trace.torque_2 / (2.0 * s.substeps)) / MILLINEWTON_PER_NEWTON,
-        trace.work / MILLINEWTON_PER_NEWTON,
-        trace.slid,
-        trace.saturated / s.substeps,
-        trace.nis / s.substeps,
-        x,
-        y,
-        motion.theta,
-        reference.x,
-        reference.y,
-        reference.theta,
-        a.infos[lane, r, CLIPPED],
+        position_error_mm=error,
+        formation_error_mm=distance(x, y, wanted_x, wanted_y),
+        heading_error_rad=wrap(reference.theta - motion.theta),
+        time_gap_error_s=late,
+        slip_mm_s=trace.slip,
+        torque_l_Nmm=trace.torque_l * to_Nmm,
+        torque_r_Nmm=trace.torque_r * to_Nmm,
+        torque_rms_Nmm=math.sqrt(trace.torque_2 / (2.0 * settings.substeps))
+        / MILLINEWTON_PER_NEWTON,
+        energy_mJ=trace.work / MILLINEWTON_PER_NEWTON,
+        slid_mm=trace.slid,
+        saturation_fraction=trace.saturated / settings.substeps,
+        innovation_nis=trace.nis / settings.substeps,
+        x_mm=x,
+        y_mm=y,
+        theta_rad=motion.theta,
+        reference_x_mm=reference.x,
+        reference_y_mm=reference.y,
+        reference_theta_rad=reference.theta,
+        clipped=arrays.infos[lane, robot, CLIPPED],
     )
     for i in range(len(info)):
-        a.infos[lane, r, i] = info[i]
+        arrays.infos[lane, robot, i] = info[i]
 
-    if error > s.lost_beyond and not a.lost[lane, r]:
-        a.lost[lane, r] = a.lost_now[lane, r] = True
+    if error > settings.lost_beyond and not arrays.lost[lane, robot]:
+        arrays.lost[lane, robot] = arrays.lost_now[lane, robot] = True
     size = change = 0.0
-    for i in range(a.actions.shape[2]):
-        size += a.actions[lane, r, i] ** 2
-        change += (a.actions[lane, r, i] - a.last_actions[lane, r, i]) ** 2
-        a.last_actions[lane, r, i] = a.actions[lane, r, i]
-    lost, touched = a.lost_now[lane, r], a.touched_now[lane, r]
+    for i in range(arrays.actions.shape[2]):
+        size += arrays.actions[lane, robot, i] ** 2
+        change += (arrays.actions[lane, robot, i] - arrays.last_actions[lane, robot, i]) ** 2
+        arrays.last_actions[lane, robot, i] = arrays.actions[lane, robot, i]
+    lost, touched = arrays.lost_now[lane, robot], arrays.touched_now[lane, robot]
     terms = reward_terms(error, change, size, trace.slip, lost, touched)
     total = 0.0
     for i in range(len(terms)):
-        a.terms[lane, r, i] = terms[i]
-        total += a.weights[i] * terms[i]
-    a.rewards[lane, r] = total
+        arrays.terms[lane, robot, i] = terms[i]
+        total += arrays.weights[i] * terms[i]
+    arrays.rewards[lane, robot] = total
 
 
 @law
-def end_lane(a: Arrays, lane: int, s: Settings) -> None:
+def end_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
     """Whether and why the episode ended in this step: for the whole formation at once.
 
     See :func:`terminated` and :func:`truncated`.
     """
-    rest = HORIZON if a.clock[lane, 1] >= s.horizon else RUNNING
-    for r in range(a.ends.shape[1]):
-        a.ends[lane, r] = RUNNING
-        if s.end_on_lost and a.lost_now[lane, r]:
-            a.ends[lane, r] = LOST
-        if s.end_on_touched and a.touched_now[lane, r]:
-            a.ends[lane, r] = TOUCHED
-        if a.ends[lane, r] != RUNNING:
+    rest = HORIZON if arrays.clock[lane, 1] >= settings.horizon else RUNNING
+    for robot in range(arrays.ends.shape[1]):
+        arrays.ends[lane, robot] = RUNNING
+        if settings.end_on_lost and arrays.lost_now[lane, robot]:
+            arrays.ends[lane, robot] = LOST
+        if settings.end_on_touched and arrays.touched_now[lane, robot]:
+            arrays.ends[lane, robot] = TOUCHED
+        if arrays.ends[lane, robot] != RUNNING:
             rest = OTHER_ROBOT
-    for r in range(a.ends.shape[1]):
-        if a.ends[lane, r] == RUNNING:
-            a.ends[lane, r] = rest
+    for robot in range(arrays.ends.shape[1]):
+        if arrays.ends[lane, robot] == RUNNING:
+            arrays.ends[lane, robot] = rest
 
 
 def terminated(ends: np.ndarray) -> np.ndarray:
-    """Who ended the episode, of any shape: who was lost or touched another."""
+    """Whether a robot ended the episode because it was lost or touched another; any shape."""
     return (ends == LOST) | (ends == TOUCHED)
 
 
 def truncated(ends: np.ndarray) -> np.ndarray:
-    """Whose episode was ended by another robot or the horizon, of any shape."""
+    """Whether another robot or the horizon ended a robot's episode; any shape."""
     return (ends == OTHER_ROBOT) | (ends == HORIZON)

@@ -1,37 +1,31 @@
-"""Everything that an episode remembers, as arrays: one quantity a row, formations last."""
+"""One table of everything that the engine keeps of a robot; where it lies in memory follows from it.
+
+A *row* is a named tuple of numbers, one of it for each robot. The rows of one kind lie in one array,
+``(field, robot, lane)``, one after the other; a lane is one formation. A *tile* (see
+:mod:`tlf_env.engine.tiles`) holds the rows of a few robots in the same order. Copying into a tile and
+back, clearing a lane at the start of an episode and taking over a scenario's constants therefore work
+on whole arrays and need no list of rows: a quantity is added by adding a row, or a field to its tuple.
+"""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Sequence
-from typing import NamedTuple
+from collections.abc import Callable
+from enum import Enum
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from tlf_env.disturbances.channels import CHANNELS, DEAD_TIME, JITTER
-from tlf_env.disturbances.model import Effects, PatchRow, leveled, patch_rows, signal_rows
-from tlf_env.numerics.compiled import reader, writer
-from tlf_env.onboard.estimator import Ekf, Estimate, ekf_constants
-from tlf_env.onboard.observer import Message, Reference
-from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate, slip_ekf_constants
-from tlf_env.onboard.wheel_loop import (
-    WheelLoop,
-    WheelLoopParameters,
-    WheelLoopState,
-    digital_wheel_loop,
-)
-from tlf_env.physics.parameters import Body, body_array
+from tlf_env.disturbances.channels import Effects
+from tlf_env.numerics.compiled import reader, row_reader, row_writer, writer
+from tlf_env.onboard.estimator import Ekf, Estimate
+from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
+from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState
+from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Motion
-from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
-from tlf_env.task.info import Info
-from tlf_env.task.measures import TIME_GAP_WINDOW_S
-from tlf_env.task.observation import sensor_entries, tracking_entries
-from tlf_env.task.reward import RewardTerms
-from tlf_env.task.scenario import Scenario
 
 
 class Sensors(NamedTuple):
-    """Last encoder readings (rad) and the wheel speeds they gave (rad/s)."""
+    """Last encoder readings (rad) and the wheel speeds that follow from them (rad/s)."""
 
     encoder_l: float
     encoder_r: float
@@ -44,7 +38,7 @@ class Trace(NamedTuple):
 
     distance: float  # odometry, mm
     turn: float  # odometry, rad
-    moved: float  # the same with the estimated slip, mm
+    moved: float  # odometry with the estimated slip, mm
     turned: float  # rad
     innovation_forward: float  # sums of the EKF's innovation in estimated body axes, mm
     innovation_right: float
@@ -53,13 +47,28 @@ class Trace(NamedTuple):
     torque_r: float
     saturated: float  # substeps with a torque at its limit
     slip: float  # largest slip speed of a drive wheel, mm/s
-    slid: float  # mean way that the drive wheels slipped, mm
+    slid: float  # mean distance that the drive wheels slipped, mm
     torque_2: float  # sum of the squared torques of both wheels, (mN·mm)²
-    work: float  # mechanical work of both motors that they put in, braking not counted, µJ
+    work: float  # mechanical work that both motors put in, braking not counted, µJ
+
+
+class WheelPair(NamedTuple):
+    """Wheel speeds (rad/s), or torques (mN·mm)."""
+
+    left: float
+    right: float
+
+
+class Pose(NamedTuple):
+    """Pose of c: mm, mm, rad."""
+
+    x: float
+    y: float
+    theta: float
 
 
 class Sample(NamedTuple):
-    """One substep's readings: position fix (mm) and the wheels' angle increments (rad)."""
+    """Sensor readings of one substep: position fix (mm) and the wheels' angle increments (rad)."""
 
     fix_x: float
     fix_y: float
@@ -67,244 +76,169 @@ class Sample(NamedTuple):
     step_r: float
 
 
-class Variants(NamedTuple):
-    """Constants of the scenarios that lanes may run, as an episode's start needs them."""
+class Order(NamedTuple):
+    """Command of one robot during a control step: rad/s, or mN·mm for torques."""
 
-    bodies: np.ndarray  # (field, robot, variant), without payload
-    wheel_loops: np.ndarray  # (field, robot, variant)
-    ekfs: np.ndarray  # (field, robot, variant)
-    slip_ekfs: np.ndarray  # (field, robot, variant)
-    levels: np.ndarray  # (variant,) of the disturbance
-    mixture: np.ndarray  # (variant,): summed shares if every episode draws its variant, else empty
-
-
-class Arrays(NamedTuple):
-    """``(field, robot, lane)`` unless said; a lane is one formation.
-
-    Where lanes come last there may be a few more than formations, which nobody uses (:func:`padded`).
-
-    Lanes may run different scenarios, their :class:`Variants`.
-    """
-
-    # constants of the variants
-    signals: np.ndarray  # (variant, channel, SignalRow)
-    patches: np.ndarray  # (variant, patch, PatchRow)
-    table: np.ndarray  # (step, Reference): the leader's reference at the control steps
-    # constants of an episode
-    variants: np.ndarray  # (lane,) int64
-    bodies: np.ndarray
-    wheel_loops: np.ndarray
-    ekfs: np.ndarray
-    slip_ekfs: np.ndarray
-    levels: np.ndarray  # (lane,) of the disturbance
-    # physics
-    motions: np.ndarray
-    contacts: np.ndarray
-    processes: np.ndarray  # (channel, robot, lane): memory of Ornstein–Uhlenbeck signals
-    applied: np.ndarray  # (channel, robot, lane): the channels' values, last evaluated
-    imposed: np.ndarray  # (channel, robot, lane): set by an adversary; NaN where not
-    torques: np.ndarray  # (wheel, slot, robot, lane): ring over the longest dead time, mN·mm
-    # on board, every substep
-    loop_states: np.ndarray
-    sensors: np.ndarray
-    estimates: np.ndarray
-    slip_estimates: np.ndarray
-    traces: np.ndarray
-    kinds: np.ndarray  # (robot, lane) int64: of each robot's action
-    wanted: np.ndarray  # wheel speeds asked for (rad/s), or torques (mN·mm)
-    wanted_before: np.ndarray  # those of the step before
-    commands: np.ndarray  # the same, or the torques (mN·mm) of a wheel loop outside
-    samples: np.ndarray  # (substep, Sample, robot, lane): what the sensors said in a control step
-    # on board, every control step
-    dropped: np.ndarray  # (slot, robot, lane) bool: whether that broadcast was lost on the air
-    messages: np.ndarray  # (Message, slot, robot, lane): ring over one gap
-    observers: np.ndarray  # (x y θ, robot, lane)
-    references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
-    # truth
-    paths: np.ndarray  # (x y, slot, robot, lane): ring over one gap and the window behind it
-    longest: np.ndarray  # (robot, lane): longest way within a control step so far, mm
-    # time and random numbers
-    clock: np.ndarray  # (lane, 3) int64: substeps, control steps, episode
-    seeds: np.ndarray  # (lane,) int64
-    # interface, formations first
-    actions: np.ndarray  # (lane, robot, 2)
-    last_actions: np.ndarray
-    twists: np.ndarray  # (lane, robot, 2): twist actions made on board, in the actions' dtype
-    observations: np.ndarray  # (lane, robot, entry): `tracking`
-    sensor_observations: (
-        np.ndarray
-    )  # (lane, robot, entry): `sensor`, without entries if not asked for
-    starts: np.ndarray  # (x y θ, robot, lane): pose of c at the start
-    terms: np.ndarray  # (lane, robot, RewardTerms)
-    rewards: np.ndarray  # (lane, robot)
-    infos: np.ndarray  # (lane, robot, Info)
-    lost: np.ndarray  # (lane, robot) bool, at any time so far
-    touched: np.ndarray
-    lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
-    touched_now: np.ndarray
-    ends: np.ndarray  # (lane, robot) int8: why the episode ended in this step, as in END_REASONS
-    scales: np.ndarray  # (entry,) of `tracking`
-    sensor_scales: np.ndarray  # (entry,) of `sensor`
-    weights: np.ndarray  # (RewardTerms,)
-    previews: np.ndarray  # (preview,) int64, in control steps
+    kind: float  # of action
+    wanted_l: float
+    wanted_r: float
+    before_l: float  # command of the first ``hold`` substeps
+    before_r: float
+    hold: float
+    dead: float  # dead time of the torques, substeps
 
 
-read_effects = reader(Effects)  # from `applied`, whose first channels these are
-read_sensors = reader(Sensors)
-write_sensors = writer(Sensors)
-read_trace = reader(Trace)
-write_trace = writer(Trace)
-write_sample = writer(Sample)
+class Traction(NamedTuple):
+    """Torques of one substep (mN·mm), and the factors on the tyres' friction."""
+
+    asked_l: float  # by the wheel loop or the action, within the motor's limit
+    asked_r: float
+    given_l: float  # delivered
+    given_r: float
+    grip_l: float
+    grip_r: float
+    grip_c: float
 
 
-def _constant(row: tuple[float, ...], robots: int, lanes: int) -> np.ndarray:
-    return np.tile(np.array(row, dtype=np.float64)[:, None, None], (1, robots, lanes))
+class Reading(NamedTuple):
+    """Encoder angles as read, rad."""
+
+    left: float
+    right: float
 
 
-def _per_variant(rows: Sequence[tuple[float, ...]], robots: int) -> np.ndarray:
-    """Rows of the variants as (field, robot, variant), every robot alike."""
-    return np.ascontiguousarray(np.repeat(np.array(rows).T[:, None, :], robots, axis=1))
+class Draw(NamedTuple):
+    """Key of a random number, whole numbers; see :func:`tlf_env.numerics.philox.words`."""
+
+    seed: int
+    robot: int
+    episode: int
+    tick: int
 
 
-FEW_LANES = 64
-DOUBLES_PER_CACHE_LINE = 8
-NOWHERE = PatchRow(x=math.inf, y=0.0, radius=0.0, scale=1.0)
+class Rolls(NamedTuple):
+    """1 if all wheels roll, so that the closed form of the plant holds; else 0."""
+
+    all: float
 
 
-def _all_patches(scenarios: Sequence[Scenario]) -> np.ndarray:
-    """Patches as (variant, patch, PatchRow), filled up with patches that nothing lies on."""
-    rows = [patch_rows(scenario.disturbance) for scenario in scenarios]
-    out = np.tile(np.array(NOWHERE), (len(rows), max(map(len, rows)), 1))
-    for patches, some in zip(out, rows, strict=True):
-        patches[: len(some)] = some
-    return out
+class Column(NamedTuple):
+    """robot · lanes + lane, a whole number: the robot's column in a flat array."""
+
+    place: int
 
 
-def longest(scenario: Scenario, channel: int) -> float:
-    """The largest value that a channel can have; its range's end if an adversary may set it."""
-    if scenario.adversary:
-        return CHANNELS[channel].high
-    reach = scenario.disturbance.signal(CHANNELS[channel].path).reach(CHANNELS[channel].nominal)
-    level = scenario.disturbance.level
-    return max(leveled(CHANNELS[channel].nominal, end, level) for end in reach)
+class Kind(Enum):
+    """How long a row lives, and where."""
+
+    CONSTANT = "constant"  # copied from the scenario when an episode starts; read in every substep
+    STATE = "state"  # changes in every substep; zero when an episode starts
+    CONTROL = "control"  # changes once per control step, so tiles leave it out; zero likewise
+    SCRATCH = "scratch"  # of one substep or one control step; in tiles only
 
 
-def _loop_row(scenario: Scenario) -> tuple[float, ...]:
-    wheel_loop = scenario.wheel_loop
-    if isinstance(wheel_loop, str):  # an object outside; the arrays' own loop rests
-        wheel_loop = WheelLoopParameters()
-    return digital_wheel_loop(wheel_loop, scenario.physics_period_s)
+class Row(NamedTuple):
+    """One row of the table."""
+
+    name: str
+    fields: type[Any]  # a named tuple of floats
+    kind: Kind
 
 
-def make_variants(scenarios: Sequence[Scenario], mixture: Sequence[float] = ()) -> Variants:
-    """Constants of the scenarios; with the shares ``mixture``, which sum to 1, episodes draw theirs."""
-    n = scenarios[0].robot_count
-    return Variants(
-        bodies=np.concatenate([body_array(list(one.robot_models)) for one in scenarios], axis=2),
-        wheel_loops=_per_variant([_loop_row(one) for one in scenarios], n),
-        ekfs=_per_variant([ekf_constants(one.ekf) for one in scenarios], n),
-        slip_ekfs=_per_variant(
-            [slip_ekf_constants(one.ekf_slip, one.physics_period_s) for one in scenarios], n
-        ),
-        levels=np.array([one.disturbance.level for one in scenarios]),
-        mixture=np.cumsum(np.array(mixture, dtype=np.float64)),
-    )
+ROWS = (
+    Row("body", Body, Kind.CONSTANT),
+    Row("wheel_loop", WheelLoop, Kind.CONSTANT),
+    Row("ekf", Ekf, Kind.CONSTANT),
+    Row("slip_ekf", SlipEkf, Kind.CONSTANT),
+    Row("motion", Motion, Kind.STATE),
+    Row("contact", Contact, Kind.STATE),
+    Row("loop_state", WheelLoopState, Kind.STATE),
+    Row("sensors", Sensors, Kind.STATE),
+    Row("estimate", Estimate, Kind.STATE),
+    Row("slip", SlipEstimate, Kind.STATE),
+    Row("trace", Trace, Kind.STATE),
+    Row("wanted", WheelPair, Kind.CONTROL),  # wheel speeds or torques that the action asks for
+    Row("wanted_before", WheelPair, Kind.CONTROL),  # those of the step before
+    Row("command", WheelPair, Kind.CONTROL),  # ``wanted``, or torques of a wheel loop outside
+    Row("observer", Pose, Kind.CONTROL),
+    Row("start", Pose, Kind.CONTROL),
+    Row("effects", Effects, Kind.SCRATCH),  # copied from the channels' values
+    Row("sample", Sample, Kind.SCRATCH),
+    Row("order", Order, Kind.SCRATCH),
+    Row("traction", Traction, Kind.SCRATCH),
+    Row("reading", Reading, Kind.SCRATCH),
+    Row("moved", Motion, Kind.SCRATCH),  # as the plant leaves it, before the pose is advanced
+    Row("impulses", Contact, Kind.SCRATCH),
+    Row("draw", Draw, Kind.SCRATCH),
+    Row("rolls", Rolls, Kind.SCRATCH),
+    Row("column", Column, Kind.SCRATCH),
+)
+BY_NAME = {row.name: row for row in ROWS}
 
 
-def padded(lanes: int) -> int:
-    """How many lanes a row has, so that rows of many lanes are an odd number of cache lines long.
-
-    A power of two would put one lane's numbers of all rows into the same few places of the cache.
-    """
-    if lanes < FEW_LANES:
-        return lanes
-    cache_lines = -(-lanes // DOUBLES_PER_CACHE_LINE)
-    return DOUBLES_PER_CACHE_LINE * (cache_lines | 1)
+def fields_of(*kinds: Kind) -> int:
+    """How many fields the rows of some kinds have."""
+    return sum(len(row.fields._fields) for row in ROWS if row.kind in kinds)
 
 
-def make_arrays(
-    scenarios: Sequence[Scenario],
-    table: np.ndarray,
-    lanes: int = 1,
-) -> Arrays:
-    """Arrays of ``lanes`` formations, not yet reset; lane k runs scenario k modulo their number.
+def _first_fields(*kinds: Kind) -> dict[str, int]:
+    """Where each row of some kinds begins, kind after kind."""
+    first, places = 0, {}
+    for row in (row for kind in kinds for row in ROWS if row.kind is kind):
+        places[row.name] = first
+        first += len(row.fields._fields)
+    return places
 
-    The scenarios may differ in their robots' parameters, wheel loops, filters and disturbances only.
-    """
-    scenario = scenarios[0]
-    n = scenario.robot_count
-    dtype = np.dtype(scenario.dtype)
-    sensor = len(sensor_entries(scenario.substeps)) if scenario.observation == "sensor" else 0
-    gap = scenario.gap_steps
-    window = round(TIME_GAP_WINDOW_S / scenario.control_period_s)
-    lookahead = max(scenario.preview_steps, default=0)
-    entries = len(tracking_entries(scenario.preview_s))
 
-    dead = max(round(longest(one, DEAD_TIME) / one.physics_period_s) for one in scenarios)
-    late = max(math.ceil(longest(one, JITTER) / one.control_period_s) for one in scenarios)
-    ring = gap + 1 + late
-    columns = padded(lanes)
+CONSTANT_FIELDS = fields_of(Kind.CONSTANT)
+STATE_FIELDS = fields_of(Kind.STATE)  # those of ``Arrays.states`` that are copied into tiles
+TILE_ROWS = fields_of(Kind.CONSTANT, Kind.STATE, Kind.SCRATCH)
+_IN_ARRAYS = _first_fields(Kind.CONSTANT) | _first_fields(Kind.STATE, Kind.CONTROL)
+_IN_TILES = _first_fields(Kind.CONSTANT, Kind.STATE, Kind.SCRATCH)
+CONSTANTS_IN_TILE, STATES_IN_TILE = 0, CONSTANT_FIELDS
+EFFECTS_IN_TILE = _IN_TILES["effects"]
 
-    def zeros(fields: int) -> np.ndarray:
-        return np.zeros((fields, n, columns))
 
-    return Arrays(
-        signals=np.array(
-            [
-                signal_rows(one.disturbance, one.physics_period_s, one.control_period_s)
-                for one in scenarios
-            ]
-        ),
-        patches=_all_patches(scenarios),
-        table=table.copy(),
-        variants=np.arange(lanes) % len(scenarios),
-        bodies=zeros(len(Body._fields)),
-        wheel_loops=zeros(len(WheelLoop._fields)),
-        ekfs=zeros(len(Ekf._fields)),
-        slip_ekfs=zeros(len(SlipEkf._fields)),
-        levels=np.zeros(lanes),
-        motions=zeros(len(Motion._fields)),
-        contacts=zeros(len(Contact._fields)),
-        processes=zeros(len(CHANNELS)),
-        applied=_constant(tuple(channel.nominal for channel in CHANNELS), n, columns),
-        imposed=np.full((len(CHANNELS), n, columns), np.nan),
-        torques=np.zeros((2, dead + 1, n, columns)),
-        loop_states=zeros(len(WheelLoopState._fields)),
-        sensors=zeros(len(Sensors._fields)),
-        estimates=zeros(len(Estimate._fields)),
-        slip_estimates=zeros(len(SlipEstimate._fields)),
-        traces=zeros(len(Trace._fields)),
-        kinds=np.full((n, columns), ACTION_KINDS[scenario.action], dtype=np.int64),
-        wanted=zeros(2),
-        wanted_before=zeros(2),
-        commands=zeros(2),
-        samples=np.zeros((scenario.substeps, len(Sample._fields), n, columns)),
-        dropped=np.zeros((ring, n, columns), dtype=np.bool_),
-        messages=np.zeros((len(Message._fields), ring, n, columns)),
-        observers=zeros(3),
-        references=np.zeros((len(Reference._fields), lookahead + 1, n, columns)),
-        paths=np.zeros((2, gap + window + 1, n, columns)),
-        longest=np.zeros((n, columns)),
-        clock=np.zeros((lanes, 3), dtype=np.int64),
-        seeds=np.zeros(lanes, dtype=np.int64),
-        actions=np.zeros((lanes, n, ACTION_SIZE)),
-        last_actions=np.zeros((lanes, n, ACTION_SIZE)),
-        twists=np.zeros((lanes, n, ACTION_SIZE), dtype=dtype),
-        observations=np.zeros((lanes, n, entries), dtype=dtype),
-        sensor_observations=np.zeros((lanes, n, sensor), dtype=dtype),
-        starts=zeros(3),
-        terms=np.zeros((lanes, n, len(RewardTerms._fields))),
-        rewards=np.zeros((lanes, n)),
-        infos=np.zeros((lanes, n, len(Info._fields))),
-        lost=np.zeros((lanes, n), dtype=np.bool_),
-        touched=np.zeros((lanes, n), dtype=np.bool_),
-        lost_now=np.zeros((lanes, n), dtype=np.bool_),
-        touched_now=np.zeros((lanes, n), dtype=np.bool_),
-        ends=np.zeros((lanes, n), dtype=np.int8),
-        scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
-        sensor_scales=np.array(
-            [entry.scale for entry in sensor_entries(scenario.substeps).values()]
-        ),
-        weights=np.array([scenario.reward[name] for name in RewardTerms._fields]),
-        previews=np.array(scenario.preview_steps, dtype=np.int64),
-    )
+def in_array(name: str, field: str | None = None) -> int:
+    """Place of a row, or of one of its fields, in ``Arrays.constants`` or ``Arrays.states``."""
+    return _IN_ARRAYS[name] + _place(name, field)
+
+
+def in_tile(name: str, field: str | None = None) -> int:
+    """Place of a row, or of one of its fields, in a tile."""
+    return _IN_TILES[name] + _place(name, field)
+
+
+def _place(name: str, field: str | None) -> int:
+    return 0 if field is None else BY_NAME[name].fields._fields.index(field)
+
+
+def array_reader(name: str) -> Callable[..., Any]:
+    """Compiled ``read(array, robot, lane)`` of a row's named tuple."""
+    return reader(BY_NAME[name].fields, in_array(name))
+
+
+def array_writer(name: str) -> Callable[..., Any]:
+    """Compiled ``write(array, robot, lane, row)``, the inverse of :func:`array_reader`."""
+    return writer(BY_NAME[name].fields, in_array(name))
+
+
+def tile_reader(name: str) -> Callable[..., Any]:
+    """Compiled ``read(tile, i)`` of a row's named tuple, for the robot in column ``i``."""
+    return row_reader(BY_NAME[name].fields, in_tile(name))
+
+
+def tile_writer(name: str) -> Callable[..., Any]:
+    """Compiled ``write(tile, i, row)``, the inverse of :func:`tile_reader`."""
+    return row_writer(BY_NAME[name].fields, in_tile(name))
+
+
+def tile_access(name: str) -> tuple[Callable[..., Any], Callable[..., Any]]:
+    """:func:`tile_reader` and :func:`tile_writer`."""
+    return tile_reader(name), tile_writer(name)
+
+
+def rows_of(array: np.ndarray, name: str) -> np.ndarray:
+    """A row's fields in its array, ``(field, robot, lane)``; a view."""
+    first = in_array(name)
+    return array[first : first + len(BY_NAME[name].fields._fields)]

@@ -5,15 +5,17 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
+import numpy as np
+
 from tlf_env.engine import drivers
-from tlf_env.engine.layout import Arrays, Sample, Sensors
+from tlf_env.engine.arrays import Arrays
+from tlf_env.engine.layout import Sample
 from tlf_env.engine.settings import Settings
 from tlf_env.onboard.parts import Factory, finite, load_part, make_part
 from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.scenario import Scenario
 
-SPEEDS = [Sensors._fields.index("speed_l"), Sensors._fields.index("speed_r")]
 STEPS = [Sample._fields.index("step_l"), Sample._fields.index("step_r")]
 FIXES = [Sample._fields.index("fix_x"), Sample._fields.index("fix_y")]
 
@@ -45,7 +47,7 @@ class Parts:
         }
         self._made: dict[str, list[Any]] = {}
 
-    def reset(self, a: Arrays, s: Settings) -> None:
+    def reset(self, arrays: Arrays, settings: Settings) -> None:
         """Make all parts anew and start them; observers run ahead by the preview.
 
         Raises
@@ -60,46 +62,50 @@ class Parts:
             ]
             for role, factory in self._factories.items()
         }
-        for estimator, pose in zip(self._of("estimator"), a.starts[:, :, 0].T, strict=False):
+        starts = arrays.rows("start")[:, :, 0]
+        for estimator, pose in zip(self._of("estimator"), starts.T, strict=False):
             estimator.reset(pose.copy())
         for loop in self._of("wheel_loop"):
             loop.reset()
-        for r, observer in enumerate(self._of("observer")):
-            if r > 0:
-                observer.reset(a.starts[:, r, 0].copy())
-                for m in range(s.lookahead + 1):
-                    self._observe_one(a, s, r, m)
+        for robot, observer in enumerate(self._of("observer")):
+            if robot > 0:
+                observer.reset(starts[:, robot].copy())
+                for step in range(settings.lookahead + 1):
+                    self._observe_one(arrays, settings, robot, step)
 
     def _of(self, role: str) -> list[Any]:
         return self._made.get(role, [])
 
-    def drive(self, a: Arrays, k: int, s: Settings) -> None:
-        """Wheel loops: put torques in the place of the commands that :attr:`Arrays.wanted` keeps."""
-        for r, loop in enumerate(self._of("wheel_loop")):
-            if a.kinds[r, 0] == TORQUE:
+    def drive(self, arrays: Arrays, substep: int, settings: Settings) -> None:
+        """Wheel loops: put torques in the place of the commands; the row ``wanted`` keeps those."""
+        for robot, loop in enumerate(self._of("wheel_loop")):
+            if arrays.kinds[robot, 0] == TORQUE:
                 continue
-            _, hold = drivers.delays_of(a, 0, r, s.dt)
-            wanted = (a.wanted_before if k < hold else a.wanted)[:, r, 0].copy()
-            measured = a.sensors[SPEEDS, r, 0]
+            _, hold = drivers.delays_of(arrays, 0, robot, settings.dt)
+            row = "wanted_before" if substep < hold else "wanted"
+            wanted = arrays.rows(row)[:, robot, 0].copy()
+            sensors = arrays.named("sensors")
+            measured = np.array([sensors.speed_l[robot, 0], sensors.speed_r[robot, 0]])
             torques = finite(
-                loop.torque(wanted, measured), 2, f"robot_{r}: the wheel loop's torque()"
+                loop.torque(wanted, measured), 2, f"robot_{robot}: the wheel loop's torque()"
             )
-            a.commands[:, r, 0] = torques * MILLINEWTON_PER_NEWTON
+            arrays.rows("command")[:, robot, 0] = torques * MILLINEWTON_PER_NEWTON
 
-    def estimate(self, a: Arrays, k: int) -> None:
-        """Estimators: update with the readings of substep ``k``."""
-        for r, estimator in enumerate(self._of("estimator")):
-            sample = a.samples[k, :, r, 0]
+    def estimate(self, arrays: Arrays, substep: int) -> None:
+        """Estimators: update with the readings of a substep."""
+        for robot, estimator in enumerate(self._of("estimator")):
+            sample = arrays.samples[substep, :, robot, 0]
             pose = estimator.update(sample[STEPS], sample[FIXES])
-            a.estimates[:3, r, 0] = finite(pose, 3, f"robot_{r}: the estimator's update()")
+            estimate = arrays.rows("estimate")
+            estimate[:3, robot, 0] = finite(pose, 3, f"robot_{robot}: the estimator's update()")
 
-    def observe(self, a: Arrays, s: Settings) -> None:
+    def observe(self, arrays: Arrays, settings: Settings) -> None:
         """Observers: the followers' next references."""
-        for r in range(1, len(self._robots)):
-            self._observe_one(a, s, r, int(a.clock[0, 1]) + s.lookahead)
+        for robot in range(1, len(self._robots)):
+            self._observe_one(arrays, settings, robot, int(arrays.clock[0, 1]) + settings.lookahead)
 
-    def _observe_one(self, a: Arrays, s: Settings, r: int, m: int) -> None:
-        message = drivers.delayed_message_of(a, 0, r, m, s)
-        reference = self._made["observer"][r].update(message, m * s.period)
-        row = finite(reference, 5, f"robot_{r}: the observer's update()")
-        a.references[:, m % a.references.shape[1], r, 0] = row
+    def _observe_one(self, arrays: Arrays, settings: Settings, robot: int, step: int) -> None:
+        message = drivers.delayed_message_of(arrays, 0, robot, step, settings)
+        reference = self._made["observer"][robot].update(message, step * settings.period)
+        row = finite(reference, 5, f"robot_{robot}: the observer's update()")
+        arrays.references[:, step % arrays.references.shape[1], robot, 0] = row

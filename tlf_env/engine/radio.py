@@ -1,11 +1,19 @@
-"""Between robots: broadcasts, what a follower hears of them, and the references that come of it."""
+"""Between robots: broadcasts, what a follower receives of them, and the references made from it."""
 
 from __future__ import annotations
 
 import math
 
 from tlf_env.disturbances.channels import DROPOUT, JITTER, RADIO_DROPOUT, RADIO_JITTER
-from tlf_env.engine.layout import Arrays, read_trace
+from tlf_env.engine.arrays import (
+    Arrays,
+    read_estimate,
+    read_motion,
+    read_observer,
+    read_trace,
+    write_observer,
+)
+from tlf_env.engine.layout import Pose
 from tlf_env.engine.settings import TRUTH, Settings
 from tlf_env.numerics.compiled import law, slot_reader, slot_writer
 from tlf_env.numerics.philox import unit, words
@@ -17,113 +25,115 @@ from tlf_env.onboard.observer import (
     observer_rates,
     smoothing,
 )
-from tlf_env.onboard.slip_estimator import SlipEstimate
-from tlf_env.physics.state import forward_and_yaw, read_motion
-
-DELTA_1 = SlipEstimate._fields.index("delta_1")
-DELTA_2 = SlipEstimate._fields.index("delta_2")
+from tlf_env.physics.state import forward_and_yaw
 
 read_message = slot_reader(Message)
 write_message = slot_writer(Message)
 
 
 @law
-def broadcast(a: Arrays, lane: int, r: int, step: int, s: Settings) -> None:
-    """Put robot ``r``'s estimated pose and twist (odometry and estimated slip) on the air.
+def broadcast(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> None:
+    """Broadcast a robot's estimated pose and twist (odometry and estimated slip).
 
-    With the estimator ``truth`` it is the true twist at the step's end. If the broadcast is lost,
-    whoever listens goes on from the last message, by dead reckoning.
+    With the estimator ``truth`` the twist is the true one at the step's end. If the broadcast is lost, the
+    follower continues from the last message by dead reckoning.
     """
-    slot = step % a.messages.shape[1]
-    if s.estimator == TRUTH:
-        u_1, u_2 = forward_and_yaw(read_motion(a.motions, r, lane))
+    slot = step % arrays.messages.shape[1]
+    if settings.estimator == TRUTH:
+        u_1, u_2 = forward_and_yaw(read_motion(arrays.states, robot, lane))
     else:
-        trace = read_trace(a.traces, r, lane)
-        u_1, u_2 = trace.moved / s.period, trace.turned / s.period
-    message = Message(
-        a.estimates[0, r, lane], a.estimates[1, r, lane], a.estimates[2, r, lane], u_1, u_2
-    )
-    dropout = a.applied[DROPOUT, r, lane]
+        trace = read_trace(arrays.states, robot, lane)
+        u_1, u_2 = trace.moved / settings.period, trace.turned / settings.period
+    estimate = read_estimate(arrays.states, robot, lane)
+    message = Message(estimate.x, estimate.y, estimate.theta, u_1, u_2)
+    dropout = arrays.applied[DROPOUT, robot, lane]
     lost = False
     if dropout > 0.0 and step > 0:
-        word, _, _, _ = words(a.seeds[lane], RADIO_DROPOUT, r, a.clock[lane, 2], step)
+        word, _, _, _ = words(arrays.seeds[lane], RADIO_DROPOUT, robot, arrays.clock[lane, 2], step)
         lost = unit(word) < dropout
-    a.dropped[slot, r, lane] = lost
+    arrays.dropped[slot, robot, lane] = lost
     if lost:
-        before = (step - 1) % a.messages.shape[1]
-        message = dead_reckoned(read_message(a.messages, before, r, lane), s.period)
-    write_message(a.messages, slot, r, lane, message)
+        before = (step - 1) % arrays.messages.shape[1]
+        message = dead_reckoned(read_message(arrays.messages, before, robot, lane), settings.period)
+    write_message(arrays.messages, slot, robot, lane, message)
 
 
 @law
-def lateness(a: Arrays, lane: int, r: int, step: int, s: Settings) -> tuple[int, int]:
+def lateness(
+    arrays: Arrays, lane: int, robot: int, step: int, settings: Settings
+) -> tuple[int, int]:
     """Control periods by which jitter makes messages older: of one gap ago, and of now."""
-    jitter = a.applied[JITTER, r, lane]
+    jitter = arrays.applied[JITTER, robot, lane]
     if not jitter > 0.0:
         return 0, 0
-    before, now, _, _ = words(a.seeds[lane], RADIO_JITTER, r, a.clock[lane, 2], step)
-    ages = math.floor(jitter / s.period + 1e-9) + 1.0
+    before, now, _, _ = words(arrays.seeds[lane], RADIO_JITTER, robot, arrays.clock[lane, 2], step)
+    ages = math.floor(jitter / settings.period + 1e-9) + 1.0
     return int(unit(before) * ages), int(unit(now) * ages)
 
 
 @law
-def heard_message(a: Arrays, lane: int, r: int, step: int, late: int, s: Settings) -> Message:
+def heard_message(
+    arrays: Arrays, lane: int, robot: int, step: int, late: int, settings: Settings
+) -> Message:
     """The predecessor at a control step, by dead reckoning from a message ``late`` periods older."""
     old = max(step - late, 0)
-    message = read_message(a.messages, old % a.messages.shape[1], r - 1, lane)
+    message = read_message(arrays.messages, old % arrays.messages.shape[1], robot - 1, lane)
     if late > 0:
-        message = dead_reckoned(message, min(late, max(step, 0)) * s.period)
+        message = dead_reckoned(message, min(late, max(step, 0)) * settings.period)
     return message
 
 
 @law
-def delayed_message(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
-    """What robot ``r`` knows at a control step of its predecessor one gap before.
+def delayed_message(
+    arrays: Arrays, lane: int, robot: int, step: int, settings: Settings
+) -> Message:
+    """A robot's message at a control step about its predecessor one gap before.
 
     Jitter makes the newest message older by a fresh draw for each step, up to whole control periods
     within it; messages carry their time, so the rest is dead reckoning. Before the first gap has
-    passed it is the predecessor's start, at rest.
+    passed, it is the predecessor's start pose, at rest.
     """
-    late, _ = lateness(a, lane, r, step, s)
-    return heard_message(a, lane, r, step - s.gap, late, s)
+    late, _ = lateness(arrays, lane, robot, step, settings)
+    return heard_message(arrays, lane, robot, step - settings.gap, late, settings)
 
 
 @law
-def latest_message(a: Arrays, lane: int, r: int, step: int, s: Settings) -> Message:
-    """What robot ``r`` knows at a control step of its predecessor now; jitter as above."""
-    _, late = lateness(a, lane, r, step, s)
-    return heard_message(a, lane, r, step, late, s)
+def latest_message(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> Message:
+    """A robot's message at a control step about its predecessor now; jitter as above."""
+    _, late = lateness(arrays, lane, robot, step, settings)
+    return heard_message(arrays, lane, robot, step, late, settings)
 
 
 @law
-def next_reference(a: Arrays, lane: int, r: int, m: int, s: Settings) -> None:
+def next_reference(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> None:
     """Put the reference of control step ``m`` into the ring and move the follower's observer on."""
-    slot = m % a.references.shape[1]
-    if r == 0:
+    slot = step % arrays.references.shape[1]
+    if robot == 0:
         for i in range(5):
-            a.references[i, slot, r, lane] = a.table[m, i]
+            arrays.references[i, slot, robot, lane] = arrays.table[step, i]
         return
-    delayed = delayed_message(a, lane, r, m, s)
-    x, y = a.observers[0, r, lane], a.observers[1, r, lane]
-    theta = a.observers[2, r, lane]
-    factor = smoothing(m * s.period, s.smoothing)
-    rate_x, rate_y, rate_theta = observer_rates(x, y, theta, delayed, s.observer_gain, factor)
+    delayed = delayed_message(arrays, lane, robot, step, settings)
+    x, y, theta = read_observer(arrays.states, robot, lane)
+    factor = smoothing(step * settings.period, settings.smoothing)
+    rate_x, rate_y, rate_theta = observer_rates(
+        x, y, theta, delayed, settings.observer_gain, factor
+    )
     reference = observed_reference(x, y, theta, rate_x, rate_y, rate_theta)
     for i in range(5):
-        a.references[i, slot, r, lane] = reference[i]
-    a.observers[0, r, lane] = x + s.period * rate_x
-    a.observers[1, r, lane] = y + s.period * rate_y
-    a.observers[2, r, lane] = theta + s.period * rate_theta
+        arrays.references[i, slot, robot, lane] = reference[i]
+    period = settings.period
+    moved = Pose(x + period * rate_x, y + period * rate_y, theta + period * rate_theta)
+    write_observer(arrays.states, robot, lane, moved)
 
 
 @law
-def read_reference(a: Arrays, lane: int, r: int, m: int) -> Reference:
+def read_reference(arrays: Arrays, lane: int, robot: int, step: int) -> Reference:
     """The reference of control step ``m``, from the ring."""
-    slot = m % a.references.shape[1]
+    slot = step % arrays.references.shape[1]
     return Reference(
-        a.references[0, slot, r, lane],
-        a.references[1, slot, r, lane],
-        a.references[2, slot, r, lane],
-        a.references[3, slot, r, lane],
-        a.references[4, slot, r, lane],
+        arrays.references[0, slot, robot, lane],
+        arrays.references[1, slot, robot, lane],
+        arrays.references[2, slot, robot, lane],
+        arrays.references[3, slot, robot, lane],
+        arrays.references[4, slot, robot, lane],
     )

@@ -45,7 +45,7 @@ class Settings(NamedTuple):
     residual_reach: float  # mm; infinity where it does far from it
 
 
-def settings(scenario: Scenario) -> Settings:
+def make_settings(scenario: Scenario) -> Settings:
     """The scenario's numbers as the drivers take them."""
     observer = scenario.observer
     paper = observer if isinstance(observer, ObserverParameters) else ObserverParameters()

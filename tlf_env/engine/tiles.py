@@ -1,133 +1,87 @@
 """The substeps of a control step, many robots at once.
 
-Robots do not act on each other within a control step unless they touch, so robots and lanes are all
-alike here: items. Some items at a time are copied into a *tile*, an array with a row for each quantity
-and a column for each item, small enough for the processor's nearest cache. Each law then runs over the
-columns in a loop of its own. The compiler knows the tile's shape and inlines the law, so that it turns the
-loop into vector instructions: eight items at once where registers are wide enough. What needs branches
-of its own (sweeps, changing channels, patches, dead time) is done item by item.
+Robots do not act on each other within a control step unless they touch, so all robots of all lanes are
+alike here. Eight of them at a time are copied into a *tile*, an array with a row for each number and a
+column for each robot, small enough for the processor's nearest cache. Each law then runs over the columns
+in a loop of its own. The compiler knows the tile's shape and inlines the law, so it turns the loop into
+vector instructions: eight robots at once where registers are wide enough. Work that needs branches of its
+own (sweeps, changing channels, patches, dead time) is done robot by robot.
 
-A vector and a single item go through the same additions and multiplications, so a formation's bits do
-not depend on what else is in its tile. A last tile that is not full repeats its last item.
+A vector and a single number go through the same additions and multiplications, so a formation's bits do
+not depend on what else is in its tile. A last tile that is not full repeats its last robot.
 """
 
 from __future__ import annotations
 
-import itertools
-from typing import Any
-
 import numpy as np
 
-from tlf_env.disturbances.channels import SUBSTEP_CHANNELS
-from tlf_env.disturbances.model import Effects, wheel_factors
-from tlf_env.engine.layout import Arrays, Sample, Sensors, Trace
+from tlf_env.disturbances.model import wheel_factors
+from tlf_env.engine.arrays import Arrays, read_command, read_wanted_before
+from tlf_env.engine.effects import OF_SUBSTEPS, delays, refresh
+from tlf_env.engine.layout import (
+    CONSTANTS_IN_TILE,
+    EFFECTS_IN_TILE,
+    STATE_FIELDS,
+    STATES_IN_TILE,
+    TILE_ROWS,
+    Draw,
+    Order,
+    Reading,
+    Sample,
+    in_tile,
+    tile_access,
+    tile_reader,
+    tile_writer,
+)
+from tlf_env.engine.sensors import (
+    ENCODER_EFFECTS,
+    NOMINAL_ENCODERS,
+    disturbed_encoders,
+    sense_robot,
+)
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.substeps import (
     EXTERNAL_TORQUE,
-    Draw,
-    Drive,
-    Order,
-    Reading,
     asked_torques,
-    delays,
-    disturbed_encoders,
     floor_under,
-    refresh,
-    sense_robot,
     trace_drive,
     undisturbed,
     wanted,
+    with_delivered,
+    with_grip,
 )
-from tlf_env.numerics.compiled import allocating, block, law, row_reader, row_writer, view
-from tlf_env.onboard.estimator import Ekf, Estimate
-from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
-from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState
+from tlf_env.numerics.compiled import allocating, block, law, view
 from tlf_env.physics.kernel import roll, slide
 from tlf_env.physics.kinematics import follow_wheels
-from tlf_env.physics.parameters import Body
-from tlf_env.physics.state import Contact, Motion, Push, advance_pose
+from tlf_env.physics.state import Push, advance_pose
 from tlf_env.task.actions import TORQUE
 
-WIDTH = 8  # items in a tile: doubles in the widest vectors there are
+WIDTH = 8  # robots in a tile: doubles in the widest vectors there are
 NO_PUSH = Push(0.0, 0.0, 0.0)
 
-# Rows of a tile: named tuples one after the other, then whether all wheels roll, and the column.
-
-
-def _first_rows(rows: tuple[type[Any], ...]) -> list[int]:
-    """Where each named tuple begins, and then where the last one ends."""
-    return [0, *itertools.accumulate(len(row._fields) for row in rows)]
-
-
-(
-    BODY,
-    LOOP,
-    EKF_ROW,
-    SLIP_EKF,
-    EFFECTS,
-    MOTION,
-    CONTACT,
-    HELD,
-    SENSORS,
-    ESTIMATE,
-    SLIP,
-    TRACE,
-    SAMPLE,
-    ORDER,
-    DRIVE,
-    READING,
-    MOVED,  # the motion as the plant leaves it, before the pose is advanced
-    IMPULSES,  # the contact, likewise
-    DRAW,
-    ROLLS,
-) = _first_rows(
-    (
-        Body,
-        WheelLoop,
-        Ekf,
-        SlipEkf,
-        Effects,
-        Motion,
-        Contact,
-        WheelLoopState,
-        Sensors,
-        Estimate,
-        SlipEstimate,
-        Trace,
-        Sample,
-        Order,
-        Drive,
-        Reading,
-        Motion,
-        Contact,
-        Draw,
-    )
-)
-COLUMN = ROLLS + 1  # robot · lanes + lane: the item's column in the arrays
-ROWS = COLUMN + 1
-
-body_of = row_reader(Body, BODY)
-loop_of = row_reader(WheelLoop, LOOP)
-ekf_of = row_reader(Ekf, EKF_ROW)
-slip_ekf_of = row_reader(SlipEkf, SLIP_EKF)
-effects_of = row_reader(Effects, EFFECTS)
-motion_of, set_motion = row_reader(Motion, MOTION), row_writer(Motion, MOTION)
-contact_of, set_contact = row_reader(Contact, CONTACT), row_writer(Contact, CONTACT)
-held_of, set_held = row_reader(WheelLoopState, HELD), row_writer(WheelLoopState, HELD)
-sensors_of, set_sensors = row_reader(Sensors, SENSORS), row_writer(Sensors, SENSORS)
-estimate_of, set_estimate = row_reader(Estimate, ESTIMATE), row_writer(Estimate, ESTIMATE)
-slip_of, set_slip = row_reader(SlipEstimate, SLIP), row_writer(SlipEstimate, SLIP)
-trace_of, set_trace = row_reader(Trace, TRACE), row_writer(Trace, TRACE)
-set_sample = row_writer(Sample, SAMPLE)
-order_of, set_order = row_reader(Order, ORDER), row_writer(Order, ORDER)
-drive_of, set_drive = row_reader(Drive, DRIVE), row_writer(Drive, DRIVE)
-reading_of, set_reading = row_reader(Reading, READING), row_writer(Reading, READING)
-moved_of, set_moved = row_reader(Motion, MOVED), row_writer(Motion, MOVED)
-impulses_of, set_impulses = row_reader(Contact, IMPULSES), row_writer(Contact, IMPULSES)
-draw_of, set_draw = row_reader(Draw, DRAW), row_writer(Draw, DRAW)  # of the tile as whole numbers
-TICK = DRAW + Draw._fields.index("tick")
-ENCODER_STD = EFFECTS + Effects._fields.index("encoder_std")
-QUANTUM = EFFECTS + Effects._fields.index("quantum")
+body_of = tile_reader("body")
+loop_of = tile_reader("wheel_loop")
+ekf_of = tile_reader("ekf")
+slip_ekf_of = tile_reader("slip_ekf")
+effects_of = tile_reader("effects")
+motion_of, set_motion = tile_access("motion")
+contact_of, set_contact = tile_access("contact")
+held_of, set_held = tile_access("loop_state")
+sensors_of, set_sensors = tile_access("sensors")
+estimate_of, set_estimate = tile_access("estimate")
+slip_of, set_slip = tile_access("slip")
+trace_of, set_trace = tile_access("trace")
+set_sample = tile_writer("sample")
+order_of, set_order = tile_access("order")
+traction_of, set_traction = tile_access("traction")
+reading_of, set_reading = tile_access("reading")
+moved_of, set_moved = tile_access("moved")
+impulses_of, set_impulses = tile_access("impulses")
+draw_of, set_draw = tile_access("draw")  # of the tile as whole numbers
+TICK = in_tile("draw", "tick")
+ROLLS = in_tile("rolls", "all")
+COLUMN = in_tile("column", "place")
+SAMPLE, SAMPLE_FIELDS = in_tile("sample"), len(Sample._fields)
 
 
 @view
@@ -149,61 +103,77 @@ def flat(array: np.ndarray) -> np.ndarray:
 
 
 @law
-def load(tile: np.ndarray, first: int, array: np.ndarray, columns: np.ndarray) -> None:
-    """Copy a flat array's fields into the tile's rows from ``first`` on."""
-    for f in range(array.shape[0]):
+def load(tile: np.ndarray, first: int, array: np.ndarray, fields: int, columns: np.ndarray) -> None:
+    """Copy the first fields of a flat array into the tile's rows from ``first`` on."""
+    for f in range(fields):
         for i in range(WIDTH):
             tile[first + f, i] = array[f, columns[i]]
 
 
 @law
-def store(tile: np.ndarray, first: int, array: np.ndarray, columns: np.ndarray, count: int) -> None:
-    """Copy the tile's rows from ``first`` on back, for its first ``count`` items."""
-    for f in range(array.shape[0]):
+def store(
+    tile: np.ndarray, first: int, array: np.ndarray, fields: int, columns: np.ndarray, count: int
+) -> None:
+    """Copy the tile's rows from ``first`` on back, for its first ``count`` robots."""
+    for f in range(fields):
         for i in range(count):
             array[f, columns[i]] = tile[first + f, i]
 
 
 @law
-def assign(
-    a: Arrays, tile: np.ndarray, lanes: np.ndarray, item: int, count: int, s: Settings
-) -> None:
-    """Write who a tile's items are and what they are asked for: ``count`` of them, from ``item`` on.
+def load_effects(tile: np.ndarray, applied: np.ndarray, columns: np.ndarray) -> None:
+    """Copy the values of the channels of every substep into the tile."""
+    for f in range(OF_SUBSTEPS.shape[0]):
+        for i in range(WIDTH):
+            tile[EFFECTS_IN_TILE + f, i] = applied[OF_SUBSTEPS[f], columns[i]]
 
-    Items are the robots 0 of the given lanes, then the robots 1, and so on.
+
+@law
+def assign(
+    arrays: Arrays, tile: np.ndarray, lanes: np.ndarray, item: int, count: int, settings: Settings
+) -> None:
+    """Write the columns, random numbers' keys and commands of ``count`` robots, from ``item`` on.
+
+    Robots 0 of the given lanes come first, then robots 1, and so on.
     """
     numbers = whole(tile)
     for i in range(WIDTH):
         j = item + min(i, count - 1)
-        r, lane = j // lanes.shape[0], lanes[j % lanes.shape[0]]
-        numbers[COLUMN, i] = r * a.motions.shape[2] + lane
-        set_draw(numbers, i, Draw(a.seeds[lane], r, a.clock[lane, 2], a.clock[lane, 0]))
-        kind = a.kinds[r, lane]
-        dead, hold = delays(a, lane, r, s.dt)
-        if s.external_wheel_loop and kind != TORQUE:
+        robot, lane = j // lanes.shape[0], lanes[j % lanes.shape[0]]
+        numbers[COLUMN, i] = robot * arrays.states.shape[2] + lane
+        set_draw(
+            numbers,
+            i,
+            Draw(arrays.seeds[lane], robot, arrays.clock[lane, 2], arrays.clock[lane, 0]),
+        )
+        kind = arrays.kinds[robot, lane]
+        dead, hold = delays(arrays, lane, robot, settings.dt)
+        if settings.external_wheel_loop and kind != TORQUE:
             kind, hold = EXTERNAL_TORQUE, 0
+        command = read_command(arrays.states, robot, lane)
+        before = read_wanted_before(arrays.states, robot, lane)
         order = Order(
-            kind,
-            a.commands[0, r, lane],
-            a.commands[1, r, lane],
-            a.wanted_before[0, r, lane],
-            a.wanted_before[1, r, lane],
-            hold,
-            dead,
+            kind=kind,
+            wanted_l=command.left,
+            wanted_r=command.right,
+            before_l=before.left,
+            before_r=before.right,
+            hold=hold,
+            dead=dead,
         )
         set_order(tile, i, order)
 
 
 @block
-def change_effects(a: Arrays, tile: np.ndarray, count: int, s: Settings) -> None:
+def change_effects(arrays: Arrays, tile: np.ndarray, count: int, settings: Settings) -> None:
     """Evaluate the channels that may change in every substep."""
-    lanes = a.motions.shape[2]
+    lanes = arrays.states.shape[2]
     changed = False
     for i in range(count):
         draw, column = draw_of(whole(tile), i), whole(tile)[COLUMN, i]
-        changed |= refresh(a, column % lanes, draw.robot, 0, SUBSTEP_CHANNELS, draw.tick, 1, s)
+        changed |= refresh(arrays, column % lanes, draw.robot, OF_SUBSTEPS, draw.tick, 1, settings)
     if changed:
-        load(tile, EFFECTS, flat(a.applied[:SUBSTEP_CHANNELS]), columns_of(tile))
+        load_effects(tile, flat(arrays.applied), columns_of(tile))
 
 
 @block
@@ -212,75 +182,57 @@ def delay_torques(torques: np.ndarray, tile: np.ndarray, count: int) -> None:
     slots, lanes = torques.shape[1], torques.shape[3]
     for i in range(count):
         draw, column = draw_of(whole(tile), i), whole(tile)[COLUMN, i]
-        drive, effects = drive_of(tile, i), effects_of(tile, i)
+        traction, effects = traction_of(tile, i), effects_of(tile, i)
         tick, dead = draw.tick + 1, int(order_of(tile, i).dead)
         ring = torques[:, :, draw.robot, column % lanes]
-        ring[0, tick % slots], ring[1, tick % slots] = drive.asked_l, drive.asked_r
+        ring[0, tick % slots], ring[1, tick % slots] = traction.asked_l, traction.asked_r
         given_l = given_r = 0.0
         if tick > dead:
             given_l, given_r = ring[0, (tick - dead) % slots], ring[1, (tick - dead) % slots]
-        given_l *= effects.gain_l
-        given_r *= effects.gain_r
-        set_drive(
-            tile,
-            i,
-            Drive(
-                drive.asked_l,
-                drive.asked_r,
-                given_l,
-                given_r,
-                drive.grip_l,
-                drive.grip_r,
-                drive.grip_c,
-            ),
-        )
+        given_l *= effects.actuator_torque_gain_l
+        given_r *= effects.actuator_torque_gain_r
+        set_traction(tile, i, with_delivered(traction, given_l, given_r))
 
 
 @block
 def meet_patches(
     patches: np.ndarray, variants: np.ndarray, lanes: int, tile: np.ndarray, count: int
 ) -> None:
-    """Scale the friction of the tyres that stand on a patch."""
+    """Scale the friction of the tyres that are on a patch."""
     for i in range(count):
-        drive, lane = drive_of(tile, i), whole(tile)[COLUMN, i] % lanes
+        traction, lane = traction_of(tile, i), whole(tile)[COLUMN, i] % lanes
         on_l, on_r, on_c = wheel_factors(
             patches[variants[lane]], body_of(tile, i), motion_of(tile, i)
         )
-        set_drive(
+        set_traction(
             tile,
             i,
-            Drive(
-                drive.asked_l,
-                drive.asked_r,
-                drive.given_l,
-                drive.given_r,
-                drive.grip_l * on_l,
-                drive.grip_r * on_r,
-                drive.grip_c * on_c,
+            with_grip(
+                traction, traction.grip_l * on_l, traction.grip_r * on_r, traction.grip_c * on_c
             ),
         )
 
 
 @law
-def follow(tile: np.ndarray, k: int, dt: float) -> None:
+def follow(tile: np.ndarray, substep: int, dt: float) -> None:
     """The ``kinematic`` plant."""
     for i in range(WIDTH):
         effects = effects_of(tile, i)
-        wanted_l, wanted_r = wanted(order_of(tile, i), k)
+        wanted_l, wanted_r = wanted(order_of(tile, i), substep)
         motion = follow_wheels(
             body_of(tile, i),
             motion_of(tile, i),
             wanted_l,
             wanted_r,
-            effects.delta_1,
-            effects.delta_2,
+            effects.slip_delta_1_mm_s,
+            effects.slip_delta_2_rad_s,
             dt,
         )
         set_motion(tile, i, motion)
 
 
 @law
-def ask(tile: np.ndarray, k: int) -> None:
+def ask(tile: np.ndarray, substep: int) -> None:
     """Wheel loops, up to the torques."""
     for i in range(WIDTH):
         asked_l, asked_r, held = asked_torques(
@@ -289,25 +241,25 @@ def ask(tile: np.ndarray, k: int) -> None:
             order_of(tile, i),
             held_of(tile, i),
             sensors_of(tile, i),
-            k,
+            substep,
         )
         set_held(tile, i, held)
-        set_drive(tile, i, undisturbed(asked_l, asked_r, effects_of(tile, i)))
+        set_traction(tile, i, undisturbed(asked_l, asked_r, effects_of(tile, i)))
 
 
 @law
 def move(tile: np.ndarray, count: int, dt: float) -> None:
     """The plant: all in closed form, then by sweeps those whose wheels do not all roll."""
     for i in range(WIDTH):
-        body, drive = body_of(tile, i), drive_of(tile, i)
+        body, traction = body_of(tile, i), traction_of(tile, i)
         rolls, motion, impulses = roll(
             body,
             motion_of(tile, i),
             contact_of(tile, i),
-            floor_under(body, effects_of(tile, i), drive),
+            floor_under(body, effects_of(tile, i), traction),
             NO_PUSH,
-            drive.given_l,
-            drive.given_r,
+            traction.given_l,
+            traction.given_r,
             dt,
         )
         set_moved(tile, i, motion)
@@ -315,15 +267,15 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
         tile[ROLLS, i] = 1.0 if rolls else 0.0
     for i in range(count):
         if tile[ROLLS, i] == 0.0:
-            body, drive = body_of(tile, i), drive_of(tile, i)
+            body, traction = body_of(tile, i), traction_of(tile, i)
             motion, impulses = slide(
                 body,
                 motion_of(tile, i),
                 contact_of(tile, i),
-                floor_under(body, effects_of(tile, i), drive),
+                floor_under(body, effects_of(tile, i), traction),
                 NO_PUSH,
-                drive.given_l,
-                drive.given_r,
+                traction.given_l,
+                traction.given_r,
                 dt,
             )
             set_moved(tile, i, motion)
@@ -332,28 +284,31 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
         motion, impulses = moved_of(tile, i), impulses_of(tile, i)
         limit = body_of(tile, i).torque_limit
         set_trace(
-            tile, i, trace_drive(trace_of(tile, i), limit, drive_of(tile, i), motion, impulses, dt)
+            tile,
+            i,
+            trace_drive(trace_of(tile, i), limit, traction_of(tile, i), motion, impulses, dt),
         )
         set_motion(tile, i, advance_pose(motion, dt))
         set_contact(tile, i, impulses)
 
 
 @law
-def any_positive(tile: np.ndarray, row: int) -> bool:
-    """Whether some item has more than 0 in a row."""
+def encoders_disturbed(tile: np.ndarray) -> bool:
+    """Whether a channel of the encoders is off its nominal value for some robot."""
     found = False
-    for i in range(WIDTH):
-        found |= tile[row, i] > 0.0
+    for f in range(ENCODER_EFFECTS.shape[0]):
+        for i in range(WIDTH):
+            found |= tile[ENCODER_EFFECTS[f], i] != NOMINAL_ENCODERS[f]
     return found
 
 
 @law
-def sense_tile(tile: np.ndarray, k: int, estimator: int, dt: float) -> None:
+def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> None:
     """Encoders, position fixes and estimators, one tick on."""
     numbers = whole(tile)
     for i in range(WIDTH):
         numbers[TICK, i] += 1
-    if any_positive(tile, ENCODER_STD) or any_positive(tile, QUANTUM):
+    if encoders_disturbed(tile):
         for i in range(WIDTH):
             reading = disturbed_encoders(
                 motion_of(tile, i), effects_of(tile, i), draw_of(numbers, i)
@@ -377,7 +332,7 @@ def sense_tile(tile: np.ndarray, k: int, estimator: int, dt: float) -> None:
             trace_of(tile, i),
             draw_of(numbers, i),
             order_of(tile, i),
-            k,
+            substep,
             estimator,
             dt,
         )
@@ -390,77 +345,65 @@ def sense_tile(tile: np.ndarray, k: int, estimator: int, dt: float) -> None:
 
 @allocating
 def advance(
-    a: Arrays, lanes: np.ndarray, begin: int, end: int, actuates: bool, senses: bool, s: Settings
-) -> None:
-    """:func:`advance_in` a tile of its own."""
-    advance_in(np.empty((ROWS, WIDTH)), a, lanes, begin, end, actuates, senses, s)
-
-
-@block
-def advance_in(
-    tile: np.ndarray,
-    a: Arrays,
+    arrays: Arrays,
     lanes: np.ndarray,
     begin: int,
     end: int,
     actuates: bool,
     senses: bool,
-    s: Settings,
+    settings: Settings,
+) -> None:
+    """:func:`advance_in` a tile of its own."""
+    advance_in(np.empty((TILE_ROWS, WIDTH)), arrays, lanes, begin, end, actuates, senses, settings)
+
+
+@block
+def advance_in(
+    tile: np.ndarray,
+    arrays: Arrays,
+    lanes: np.ndarray,
+    begin: int,
+    end: int,
+    actuates: bool,
+    senses: bool,
+    settings: Settings,
 ) -> None:
     """Run the substeps ``begin`` to before ``end`` of a control step of some lanes, without contact.
 
     Without ``senses`` each stops after the plant's new velocities and poses, and without ``actuates`` it
     begins there.
     """
-    bodies, loops, ekfs = flat(a.bodies), flat(a.wheel_loops), flat(a.ekfs)
-    applied = flat(a.applied[:SUBSTEP_CHANNELS])
-    motions, contacts, traces = flat(a.motions), flat(a.contacts), flat(a.traces)
-    held, sensors, estimates = flat(a.loop_states), flat(a.sensors), flat(a.estimates)
-    slip_ekfs, slips = flat(a.slip_ekfs), flat(a.slip_estimates)
-    samples = a.samples.reshape((*a.samples.shape[:2], a.motions.shape[1] * a.motions.shape[2]))
-    torques, patches, variants = a.torques, a.patches, a.variants
+    constants, states, applied = flat(arrays.constants), flat(arrays.states), flat(arrays.applied)
+    robots, lanes_in_all = arrays.states.shape[1], arrays.states.shape[2]
+    samples = arrays.samples.reshape((*arrays.samples.shape[:2], robots * lanes_in_all))
+    torques, patches, variants = arrays.torques, arrays.patches, arrays.variants
     columns = columns_of(tile)
-    items = lanes.shape[0] * a.motions.shape[1]
+    items = lanes.shape[0] * robots
     for item in range(0, items, WIDTH):
         count = min(WIDTH, items - item)
-        assign(a, tile, lanes, item, count, s)
-        load(tile, BODY, bodies, columns)
-        load(tile, LOOP, loops, columns)
-        load(tile, EKF_ROW, ekfs, columns)
-        load(tile, SLIP_EKF, slip_ekfs, columns)
-        load(tile, EFFECTS, applied, columns)
-        load(tile, MOTION, motions, columns)
-        load(tile, CONTACT, contacts, columns)
-        load(tile, HELD, held, columns)
-        load(tile, SENSORS, sensors, columns)
-        load(tile, ESTIMATE, estimates, columns)
-        load(tile, SLIP, slips, columns)
-        load(tile, TRACE, traces, columns)
-        for k in range(begin, end):
+        assign(arrays, tile, lanes, item, count, settings)
+        load(tile, CONSTANTS_IN_TILE, constants, constants.shape[0], columns)
+        load(tile, STATES_IN_TILE, states, STATE_FIELDS, columns)
+        load_effects(tile, applied, columns)
+        for substep in range(begin, end):
             if actuates:
-                if s.changing:
-                    change_effects(a, tile, count, s)
-                if s.kinematic:
-                    follow(tile, k, s.dt)
+                if settings.changing:
+                    change_effects(arrays, tile, count, settings)
+                if settings.kinematic:
+                    follow(tile, substep, settings.dt)
                 else:
-                    ask(tile, k)
+                    ask(tile, substep)
                     if torques.shape[1] > 1:
                         delay_torques(torques, tile, count)
                     if patches.shape[1] > 0:
-                        meet_patches(patches, variants, a.motions.shape[2], tile, count)
-                    move(tile, count, s.dt)
+                        meet_patches(patches, variants, lanes_in_all, tile, count)
+                    move(tile, count, settings.dt)
             if senses:
-                sense_tile(tile, k, s.estimator, s.dt)
-                for f in range(samples.shape[1]):
+                sense_tile(tile, substep, settings.estimator, settings.dt)
+                for f in range(SAMPLE_FIELDS):
                     for i in range(count):
-                        samples[k, f, columns[i]] = tile[SAMPLE + f, i]
-        store(tile, MOTION, motions, columns, count)
-        store(tile, CONTACT, contacts, columns, count)
-        store(tile, HELD, held, columns, count)
-        store(tile, SENSORS, sensors, columns, count)
-        store(tile, ESTIMATE, estimates, columns, count)
-        store(tile, SLIP, slips, columns, count)
-        store(tile, TRACE, traces, columns, count)
+                        samples[substep, f, columns[i]] = tile[SAMPLE + f, i]
+        store(tile, STATES_IN_TILE, states, STATE_FIELDS, columns, count)
     if senses:
         for i in range(lanes.shape[0]):
-            a.clock[lanes[i], 0] += end - begin
+            arrays.clock[lanes[i], 0] += end - begin

@@ -336,7 +336,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return self._renderer.draw(scene_of(self._formation))
 
     def _path_mm(self) -> np.ndarray:
-        return self._formation.arrays.table[:, :2]
+        return self._formation.leader_path()
 
     def close(self) -> None:
         """Close the window, if there is one."""

@@ -132,17 +132,19 @@ def fetch_add(typing: Any, numbers: Any, amount: Any) -> Any:
     return types.int64(numbers, types.int64), build
 
 
-def reader(row: type[Any]) -> Callable[..., Any]:
-    """Compiled ``read(array, robot, lane)`` that gathers a named tuple from ``array[field, robot, lane]``."""
-    fields = ", ".join(f"a[{i}, r, l]" for i in range(len(row._fields)))
+def reader(row: type[Any], first: int = 0) -> Callable[..., Any]:
+    """Compiled ``read(array, robot, lane)``: a named tuple from ``array[first + field, robot, lane]``."""
+    fields = ", ".join(f"a[{first + i}, r, l]" for i in range(len(row._fields)))
     scope: dict[str, Any] = {"Row": row}
     exec(f"def read(a, r, l):\n    return Row({fields})\n", scope)
     return law(scope["read"])
 
 
-def writer(row: type[Any]) -> Callable[..., Any]:
+def writer(row: type[Any], first: int = 0) -> Callable[..., Any]:
     """Compiled ``write(array, robot, lane, row)``, the inverse of :func:`reader`."""
-    lines = "\n".join(f"    a[{i}, r, l] = row.{name}" for i, name in enumerate(row._fields))
+    lines = "\n".join(
+        f"    a[{first + i}, r, l] = row.{name}" for i, name in enumerate(row._fields)
+    )
     scope: dict[str, Any] = {}
     exec(f"def write(a, r, l, row):\n{lines}\n", scope)
     return law(scope["write"])

@@ -7,9 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tlf_env.engine.formation import Formation
-from tlf_env.onboard.observer import Reference
-from tlf_env.physics.state import Contact, Motion
-from tlf_env.task.info import Info, State
+from tlf_env.task.info import State
 
 STILL_MM = 1e-3  # who went less has no direction
 
@@ -44,35 +42,31 @@ class Scene(NamedTuple):
 
 def scene_of(formation: Formation) -> Scene:
     """The scene of a formation as it is now: the truth, in fresh arrays."""
-    a = formation.arrays
-    motion = dict(zip(Motion._fields, a.motions[:, :, 0].copy(), strict=True))
-    contact = dict(zip(Contact._fields, a.contacts[:, :, 0].copy(), strict=True))
+    motion, contact = formation.named("motion"), formation.named("contact")
+    reference, info = formation.reference(), formation.info()
     state = dict(zip(State._fields, formation.state().T, strict=True))
-    slot = formation.step_count % a.references.shape[1]
-    reference = dict(zip(Reference._fields, a.references[:, slot, :, 0].copy(), strict=True))
-    info = dict(zip(Info._fields, a.infos[0].T.copy(), strict=True))
-    ghost_x_mm, ghost_y_mm, ghost_theta_rad = _ghosts(formation, motion["theta"])
+    ghost_x_mm, ghost_y_mm, ghost_theta_rad = _ghosts(formation, motion.theta)
     return Scene(
         t_s=formation.time_s,
         x_mm=state["x_mm"],
         y_mm=state["y_mm"],
-        theta_rad=motion["theta"],
+        theta_rad=motion.theta.copy(),
         castor_rad=state["castor_rad"],
-        wheel_angle_l_rad=motion["angle_l"],
-        wheel_angle_r_rad=motion["angle_r"],
-        reference_x_mm=reference["x"],
-        reference_y_mm=reference["y"],
-        reference_theta_rad=reference["theta"],
+        wheel_angle_l_rad=motion.angle_l.copy(),
+        wheel_angle_r_rad=motion.angle_r.copy(),
+        reference_x_mm=reference.x.copy(),
+        reference_y_mm=reference.y.copy(),
+        reference_theta_rad=reference.theta.copy(),
         ghost_x_mm=ghost_x_mm,
         ghost_y_mm=ghost_y_mm,
         ghost_theta_rad=ghost_theta_rad,
-        slip_l_mm_s=contact["slip_l"],
-        slip_r_mm_s=contact["slip_r"],
-        slip_c_mm_s=contact["slip_c"],
-        position_error_mm=info["position_error_mm"],
-        time_gap_error_s=info["time_gap_error_s"],
-        lost=a.lost[0].copy(),
-        touched=a.touched[0].copy(),
+        slip_l_mm_s=contact.slip_l.copy(),
+        slip_r_mm_s=contact.slip_r.copy(),
+        slip_c_mm_s=contact.slip_c.copy(),
+        position_error_mm=info.position_error_mm.copy(),
+        time_gap_error_s=info.time_gap_error_s.copy(),
+        lost=formation.arrays.lost[0].copy(),
+        touched=formation.arrays.touched[0].copy(),
     )
 
 
@@ -81,14 +75,14 @@ def _ghosts(formation: Formation, theta: np.ndarray) -> np.ndarray:
 
     Its heading is the direction it went; where it stood still, the one it has now.
     """
-    paths = formation.arrays.paths[:, :, :-1, 0]  # of the predecessors
     ghosts = np.full((3, len(theta)), np.nan)
     step = formation.step_count - formation.scenario.gap_steps
     if step < 0 or len(theta) == 1:
         return ghosts
-    slots = paths.shape[1]
-    went_x, went_y = paths[:, (step + 1) % slots] - paths[:, max(step - 1, 0) % slots]
-    ghosts[:2, 1:] = paths[:, step % slots]
+    before = formation.true_positions(max(step - 1, 0))[:, :-1]  # of the predecessors
+    after = formation.true_positions(step + 1)[:, :-1]
+    went_x, went_y = after - before
+    ghosts[:2, 1:] = formation.true_positions(step)[:, :-1]
     moved = np.hypot(went_x, went_y) > STILL_MM
     ghosts[2, 1:] = np.where(moved, np.arctan2(-went_x, went_y), theta[:-1])
     return ghosts

@@ -1,0 +1,262 @@
+"""The arrays that an episode remembers: constants, states, rings over time, and what interfaces read."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tlf_env.disturbances.channels import CHANNELS, DEAD_TIME, JITTER
+from tlf_env.disturbances.model import PatchRow, leveled, patch_rows, signal_rows
+from tlf_env.engine.layout import (
+    BY_NAME,
+    CONSTANT_FIELDS,
+    ROWS,
+    Kind,
+    Sample,
+    array_reader,
+    array_writer,
+    fields_of,
+    rows_of,
+)
+from tlf_env.onboard.estimator import ekf_constants
+from tlf_env.onboard.observer import Message, Reference
+from tlf_env.onboard.slip_estimator import slip_ekf_constants
+from tlf_env.onboard.wheel_loop import WheelLoopParameters, digital_wheel_loop
+from tlf_env.physics.parameters import body
+from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
+from tlf_env.task.info import Info
+from tlf_env.task.measures import TIME_GAP_WINDOW_S
+from tlf_env.task.observation import sensor_entries, tracking_entries
+from tlf_env.task.reward import RewardTerms
+from tlf_env.task.scenario import Scenario
+
+FEW_LANES = 64
+DOUBLES_PER_CACHE_LINE = 8
+FAR_AWAY = PatchRow(x=math.inf, y=0.0, radius=0.0, scale=1.0)  # no robot is ever on it
+
+
+class Variants(NamedTuple):
+    """Constants of the scenarios that lanes may run (their variants), as an episode's start needs them."""
+
+    constants: np.ndarray  # (field, robot, variant), bodies without payload
+    levels: np.ndarray  # (variant,) of the disturbance
+    mixture: np.ndarray  # (variant,): summed shares if every episode draws its variant, else empty
+
+
+class Arrays(NamedTuple):
+    """``(field, robot, lane)`` unless another shape is given; a lane is one formation.
+
+    Where lanes come last, some unused ones may follow (:func:`padded`). Lanes may run different
+    scenarios, their :class:`Variants`.
+    """
+
+    # constants of the variants
+    signals: np.ndarray  # (variant, channel, SignalRow)
+    patches: np.ndarray  # (variant, patch, PatchRow)
+    table: np.ndarray  # (step, Reference): the leader's reference at the control steps
+    # constants of an episode
+    variants: np.ndarray  # (lane,) int64
+    constants: np.ndarray  # the rows of kind CONSTANT
+    levels: np.ndarray  # (lane,) of the disturbance
+    # what changes
+    states: np.ndarray  # the rows of kind STATE, then those of kind CONTROL
+    processes: np.ndarray  # (channel, robot, lane): memory of Ornstein–Uhlenbeck signals
+    applied: np.ndarray  # (channel, robot, lane): the channels' values, last evaluated
+    imposed: np.ndarray  # (channel, robot, lane): values set by an adversary, else NaN
+    torques: np.ndarray  # (wheel, slot, robot, lane): ring over the longest dead time, mN·mm
+    kinds: np.ndarray  # (robot, lane) int64: of each robot's action
+    samples: np.ndarray  # (substep, Sample, robot, lane): sensor readings of a control step
+    dropped: np.ndarray  # (slot, robot, lane) bool: whether that broadcast was lost
+    messages: np.ndarray  # (Message, slot, robot, lane): ring over one gap
+    references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
+    paths: np.ndarray  # (x y, slot, robot, lane): true positions, ring over one gap and a window
+    longest: np.ndarray  # (robot, lane): longest distance within a control step so far, mm
+    # time and random numbers
+    clock: np.ndarray  # (lane, 3) int64: substeps, control steps, episode
+    seeds: np.ndarray  # (lane,) int64
+    # interface, formations first
+    actions: np.ndarray  # (lane, robot, 2)
+    last_actions: np.ndarray
+    twists: np.ndarray  # (lane, robot, 2): twist actions made on board, in the actions' dtype
+    observations: np.ndarray  # (lane, robot, entry): `tracking`
+    sensor_observations: np.ndarray  # (lane, robot, entry): `sensor`, without entries if unused
+    terms: np.ndarray  # (lane, robot, RewardTerms)
+    rewards: np.ndarray  # (lane, robot)
+    infos: np.ndarray  # (lane, robot, Info)
+    lost: np.ndarray  # (lane, robot) bool, at any time so far
+    touched: np.ndarray
+    lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
+    touched_now: np.ndarray
+    ends: np.ndarray  # (lane, robot) int8: why the episode ended in this step, as in END_REASONS
+    scales: np.ndarray  # (entry,) of `tracking`
+    sensor_scales: np.ndarray  # (entry,) of `sensor`
+    weights: np.ndarray  # (RewardTerms,)
+    previews: np.ndarray  # (preview,) int64, in control steps
+
+    def rows(self, name: str) -> np.ndarray:
+        """A row of the engine's table by name, ``(field, robot, lane)``; a view."""
+        constant = BY_NAME[name].kind is Kind.CONSTANT
+        return rows_of(self.constants if constant else self.states, name)
+
+    def named(self, name: str) -> Any:
+        """A row's named tuple, each field an array ``(robot, lane)``, unused lanes left out; views."""
+        return BY_NAME[name].fields(*self.rows(name)[:, :, : len(self.seeds)])
+
+    def slot(self, ring: np.ndarray, step: int) -> np.ndarray:
+        """A ring's entry of a control step, ``(field, robot, lane)``, unused lanes left out; a view."""
+        return ring[:, step % ring.shape[1], :, : len(self.seeds)]
+
+
+read_body, write_body = array_reader("body"), array_writer("body")
+read_motion, write_motion = array_reader("motion"), array_writer("motion")
+read_estimate, write_estimate = array_reader("estimate"), array_writer("estimate")
+read_slip = array_reader("slip")
+read_trace = array_reader("trace")
+read_wanted, write_wanted = array_reader("wanted"), array_writer("wanted")
+read_wanted_before, write_wanted_before = (
+    array_reader("wanted_before"),
+    array_writer("wanted_before"),
+)
+read_command, write_command = array_reader("command"), array_writer("command")
+read_observer, write_observer = array_reader("observer"), array_writer("observer")
+read_start, write_start = array_reader("start"), array_writer("start")
+
+
+def constant_rows(scenario: Scenario) -> dict[str, Sequence[tuple[float, ...]]]:
+    """Values of the rows of kind CONSTANT for a scenario, by name, one tuple for each robot."""
+    loop = scenario.wheel_loop
+    if isinstance(loop, str):  # an object outside; the engine's own loop is not used
+        loop = WheelLoopParameters()
+    robots, dt_s = scenario.robot_models, scenario.physics_period_s
+    return {
+        "body": [body(robot) for robot in robots],
+        "wheel_loop": [digital_wheel_loop(loop, dt_s)] * len(robots),
+        "ekf": [ekf_constants(scenario.ekf)] * len(robots),
+        "slip_ekf": [slip_ekf_constants(scenario.ekf_slip, dt_s)] * len(robots),
+    }
+
+
+def make_constants(scenario: Scenario) -> np.ndarray:
+    """The rows of kind CONSTANT for a scenario, (field, robot)."""
+    made = constant_rows(scenario)
+    names = [row.name for row in ROWS if row.kind is Kind.CONSTANT]
+    return np.concatenate([np.array(made[name], dtype=np.float64).T for name in names])
+
+
+def _all_patches(scenarios: Sequence[Scenario]) -> np.ndarray:
+    """Patches as (variant, patch, PatchRow), filled up with patches that no robot is ever on."""
+    rows = [patch_rows(scenario.disturbance) for scenario in scenarios]
+    out = np.tile(np.array(FAR_AWAY), (len(rows), max(map(len, rows)), 1))
+    for patches, some in zip(out, rows, strict=True):
+        patches[: len(some)] = some
+    return out
+
+
+def longest(scenario: Scenario, channel: int) -> float:
+    """The largest value that a channel can have; its range's end if an adversary may set it."""
+    if scenario.adversary:
+        return CHANNELS[channel].high
+    reach = scenario.disturbance.signal(CHANNELS[channel].path).reach(CHANNELS[channel].nominal)
+    level = scenario.disturbance.level
+    return max(leveled(CHANNELS[channel].nominal, end, level) for end in reach)
+
+
+def make_variants(scenarios: Sequence[Scenario], mixture: Sequence[float] = ()) -> Variants:
+    """Constants of the scenarios; with the shares ``mixture``, which sum to 1, episodes draw theirs."""
+    return Variants(
+        constants=np.ascontiguousarray(
+            np.stack([make_constants(one) for one in scenarios], axis=-1)
+        ),
+        levels=np.array([one.disturbance.level for one in scenarios]),
+        mixture=np.cumsum(np.array(mixture, dtype=np.float64)),
+    )
+
+
+def padded(lanes: int) -> int:
+    """How many lanes a row has, so that rows of many lanes are an odd number of cache lines long.
+
+    A power of two would put one lane's numbers of all rows into the same few places of the cache.
+    """
+    if lanes < FEW_LANES:
+        return lanes
+    cache_lines = -(-lanes // DOUBLES_PER_CACHE_LINE)
+    return DOUBLES_PER_CACHE_LINE * (cache_lines | 1)
+
+
+def make_arrays(
+    scenarios: Sequence[Scenario],
+    table: np.ndarray,
+    lanes: int = 1,
+) -> Arrays:
+    """Arrays of ``lanes`` formations, not yet reset; lane k runs scenario k modulo their number.
+
+    The scenarios may differ in their robots' parameters, wheel loops, filters and disturbances only.
+    """
+    scenario = scenarios[0]
+    robots = scenario.robot_count
+    dtype = np.dtype(scenario.dtype)
+    sensor = len(sensor_entries(scenario.substeps)) if scenario.observation == "sensor" else 0
+    gap = scenario.gap_steps
+    window = round(TIME_GAP_WINDOW_S / scenario.control_period_s)
+    lookahead = max(scenario.preview_steps, default=0)
+    entries = len(tracking_entries(scenario.preview_s))
+
+    dead = max(round(longest(one, DEAD_TIME) / one.physics_period_s) for one in scenarios)
+    late = max(math.ceil(longest(one, JITTER) / one.control_period_s) for one in scenarios)
+    ring = gap + 1 + late
+    columns = padded(lanes)
+
+    def zeros(fields: int) -> np.ndarray:
+        return np.zeros((fields, robots, columns))
+
+    return Arrays(
+        signals=np.array(
+            [
+                signal_rows(one.disturbance, one.physics_period_s, one.control_period_s)
+                for one in scenarios
+            ]
+        ),
+        patches=_all_patches(scenarios),
+        table=table.copy(),
+        variants=np.arange(lanes) % len(scenarios),
+        constants=zeros(CONSTANT_FIELDS),
+        levels=np.zeros(lanes),
+        states=zeros(fields_of(Kind.STATE, Kind.CONTROL)),
+        processes=zeros(len(CHANNELS)),
+        applied=np.tile(
+            np.array([channel.nominal for channel in CHANNELS])[:, None, None], (1, robots, columns)
+        ),
+        imposed=np.full((len(CHANNELS), robots, columns), np.nan),
+        torques=np.zeros((2, dead + 1, robots, columns)),
+        kinds=np.full((robots, columns), ACTION_KINDS[scenario.action], dtype=np.int64),
+        samples=np.zeros((scenario.substeps, len(Sample._fields), robots, columns)),
+        dropped=np.zeros((ring, robots, columns), dtype=np.bool_),
+        messages=np.zeros((len(Message._fields), ring, robots, columns)),
+        references=np.zeros((len(Reference._fields), lookahead + 1, robots, columns)),
+        paths=np.zeros((2, gap + window + 1, robots, columns)),
+        longest=np.zeros((robots, columns)),
+        clock=np.zeros((lanes, 3), dtype=np.int64),
+        seeds=np.zeros(lanes, dtype=np.int64),
+        actions=np.zeros((lanes, robots, ACTION_SIZE)),
+        last_actions=np.zeros((lanes, robots, ACTION_SIZE)),
+        twists=np.zeros((lanes, robots, ACTION_SIZE), dtype=dtype),
+        observations=np.zeros((lanes, robots, entries), dtype=dtype),
+        sensor_observations=np.zeros((lanes, robots, sensor), dtype=dtype),
+        terms=np.zeros((lanes, robots, len(RewardTerms._fields))),
+        rewards=np.zeros((lanes, robots)),
+        infos=np.zeros((lanes, robots, len(Info._fields))),
+        lost=np.zeros((lanes, robots), dtype=np.bool_),
+        touched=np.zeros((lanes, robots), dtype=np.bool_),
+        lost_now=np.zeros((lanes, robots), dtype=np.bool_),
+        touched_now=np.zeros((lanes, robots), dtype=np.bool_),
+        ends=np.zeros((lanes, robots), dtype=np.int8),
+        scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
+        sensor_scales=np.array(
+            [entry.scale for entry in sensor_entries(scenario.substeps).values()]
+        ),
+        weights=np.array([scenario.reward[name] for name in RewardTerms._fields]),
+        previews=np.array(scenario.preview_steps, dtype=np.int64),
+    )
