@@ -1,4 +1,4 @@
-# Everything runs in .venv, which is made on first use and again when its requirements change.
+# Everything runs in .venv, which is created on first use and updated when its requirements change.
 
 PYTHON ?= python3
 TORCH ?= 2.13.0
@@ -15,19 +15,19 @@ help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
 	while IFS='|' read -r target text; do printf '%-20s %s\n' "  $$target" "$$text"; done
 
-run: $(VENV)/.stamp-run ## Drive the reference policy on the infinity preset, into results/infinity
+run: $(VENV)/.stamp-run ## Run the reference policy on the preset infinity; results in results/infinity
 	$(BIN)/tlf run infinity --out results/infinity
 
-test: check ## Check, then run the tests
+test: check ## Run the checks, then the tests
 	$(BIN)/pytest
 
-test-slow: $(VENV)/.stamp-test ## Run the long tests
+test-slow: $(VENV)/.stamp-test ## Run the slow tests
 	$(BIN)/pytest -m slow
 
-test-learning: $(VENV)/.stamp-train ## Run what needs stable-baselines3 and torch
+test-learning: $(VENV)/.stamp-train ## Run the tests that need stable-baselines3 and torch
 	$(BIN)/pytest tests/test_sb3.py tests/test_learned.py tests/test_examples.py tests/test_gymnasium.py
 
-check: $(VENV)/.stamp-test ## Lint, check the format and the types
+check: $(VENV)/.stamp-test ## Lint, check format and types
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
@@ -36,20 +36,20 @@ format: $(VENV)/.stamp-test ## Sort the imports and format the sources
 	$(BIN)/ruff check --select I --fix
 	$(BIN)/ruff format
 
-speed: $(VENV)/.stamp-test ## Measure the steps per second, beside a peer
+speed: $(VENV)/.stamp-test ## Measure steps per second, compared with other environments
 	$(BIN)/tlf speed
 
-speed-docs: $(VENV)/.stamp-test ## Measure them for docs/performance.md, and write its tables and figure
+speed-docs: $(VENV)/.stamp-test ## Measure steps per second and update docs/performance.md and its figure
 	$(BIN)/tlf speed --out docs/performance.json >/dev/null
 	$(BIN)/python docs/figures/make_speed.py
 
-board: $(VENV)/.stamp-test ## Run the published leaderboard's plan (hours; it resumes), and write its pages
+board: $(VENV)/.stamp-test ## Run the plan of the published leaderboard (hours, resumable) and write its pages
 	$(BIN)/tlf bench --plan board --out results/board
 	$(BIN)/python docs/figures/make_board.py results/board
 
-# torch is fixed by hand (make constraints TORCH=...), and everything else is resolved anew. What
-# torch requires on one kind of machine only is left out.
-constraints: ## Write constraints.txt anew, from a throw-away environment with every extra
+# The version of torch is fixed (make constraints TORCH=...); all others are resolved again.
+# Requirements of torch that exist on one kind of machine only are left out.
+constraints: ## Update constraints.txt from a temporary environment with every extra
 	@set -e; \
 	tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \
 	$(PYTHON) -m venv "$$tmp/venv"; \
@@ -75,7 +75,7 @@ $(VENV)/.stamp-run: $(VENV)/.stamp-venv pyproject.toml constraints.txt
 	$(PIP) -c constraints.txt -e ".[figures]"
 	@touch $@
 
-# mpe2 is named alone: the extra `peers` would bring vmas, and vmas brings torch.
+# mpe2 instead of the extra `peers`, because that also installs vmas and with it torch.
 $(VENV)/.stamp-test: $(VENV)/.stamp-run
 	$(PIP) -c constraints.txt -e ".[figures,view,bench,tune,dev]" mpe2
 	@touch $@

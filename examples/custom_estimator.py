@@ -1,7 +1,7 @@
-"""A pose estimator of one's own: odometry, drawn towards the position fixes by constant gains.
+"""A user-defined pose estimator: odometry, corrected towards the position fixes by constant gains.
 
-Shows the estimator's protocol (``factory(robot, period_s)``, ``reset``, ``update``) and compares the
-filter with the paper's EKF on the same draws. It runs on every robot, every millisecond.
+It shows the estimator protocol (``factory(robot, period_s)``, ``reset``, ``update``) and compares the
+filter with the paper's EKF on the same random draws. The filter runs on every robot, every millisecond.
 
     python examples/custom_estimator.py --horizon-s 100
     tlf run infinity --estimator examples.custom_estimator:ComplementaryFilter
@@ -20,11 +20,11 @@ from tlf_env import load_scenario
 from tlf_env.physics.parameters import RobotParameters
 
 POSITION_GAIN_PER_S = 8.0
-HEADING_GAIN_RAD_S_MM = 0.02  # turns the heading for a fix that lies to the side
+HEADING_GAIN_RAD_S_MM = 0.02  # correction of the heading per lateral deviation of a fix
 
 
 class ComplementaryFilter:
-    """Pose of c from encoders, with the fixes correcting slowly what odometry gets wrong."""
+    """Pose of c, the axle's midpoint, from the encoders, slowly corrected by the position fixes."""
 
     def __init__(self, robot: RobotParameters, period_s: float) -> None:
         self._radius = robot.wheel_radius_mm
@@ -38,14 +38,17 @@ class ComplementaryFilter:
         self._pose = pose.copy()
 
     def update(self, steps_rad: np.ndarray, fix_mm: np.ndarray) -> np.ndarray:
-        """Roll on by the wheels' increments, then correct by the fix."""
+        """Integrate the wheels' increments, then correct by the fix.
+
+        Heading 0 points along +y, unlike ROS REP-103 (+x).
+        """
         left, right = self._radius * steps_rad
         forward, turn = 0.5 * (left + right), (right - left) / self._width
         x, y, theta = self._pose
         x -= forward * math.sin(theta + 0.5 * turn)
         y += forward * math.cos(theta + 0.5 * turn)
         theta += turn
-        # A fix to the right of the estimate, driving forward: the heading points too far left.
+        # If a fix is to the right of the estimate while driving forward, the heading is too far left.
         off_x, off_y = fix_mm[0] - x, fix_mm[1] - y
         to_the_right = off_x * math.cos(theta) + off_y * math.sin(theta)
         theta -= self._turn * to_the_right * np.sign(forward)
@@ -54,7 +57,7 @@ class ComplementaryFilter:
 
 
 def main(horizon_s: float = 100.0, seed: int = 0) -> None:
-    """Drive the ∞ with the EKF and with the filter above."""
+    """Run the ∞ with the EKF and with the filter above."""
     for estimator in ("ekf", f"{__name__}:ComplementaryFilter"):
         scenario = load_scenario("infinity", estimator=estimator, horizon_s=horizon_s)
         record = run_policy(scenario, ReferencePolicy(), seed)

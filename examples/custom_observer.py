@@ -1,10 +1,9 @@
-"""An observer of one's own: a pure delay line, where the paper's is a dynamic system.
+"""A user-defined observer: a pure delay line instead of the paper's dynamic system.
 
-A follower's reference is what its predecessor broadcast one time gap ago, taken as it is. Only until
-that starts to move is there something to add: the way from the follower's own start to the
-predecessor's, interpolated smoothly. Shows the observer's protocol (``factory(robot, period_s)``,
-``reset``, ``update``). Position noise of the predecessor passes through a delay line; the paper's
-observer filters it.
+A follower's reference is the message that its predecessor broadcast one time gap ago. During the first
+seconds it is blended with a smooth path from the follower's own start to the predecessor's. The example
+shows the observer protocol (``factory(robot, period_s)``, ``reset``, ``update``). A delay line passes on
+the position noise of the predecessor; the paper's observer filters it.
 
     python examples/custom_observer.py --horizon-s 100
     tlf run infinity --observer examples.custom_observer:DelayLine
@@ -27,7 +26,7 @@ BLEND_S = 5.0
 
 
 class DelayLine:
-    """The delayed message is the reference, blended in over the first seconds."""
+    """The delayed message as reference, blended in over the first ``BLEND_S`` seconds."""
 
     def __init__(self, robot: RobotParameters, period_s: float) -> None:
         self._start = np.zeros(3)
@@ -37,7 +36,7 @@ class DelayLine:
         self._start = pose.copy()
 
     def update(self, message: Message, t_s: float) -> Reference:
-        """The reference for the time ``t_s``, given what was broadcast one gap before it."""
+        """The reference for the time ``t_s``, from the message broadcast one gap earlier."""
         if t_s >= BLEND_S:
             return Reference(*message)
         part = t_s / BLEND_S
@@ -50,7 +49,7 @@ class DelayLine:
 
 
 def main(horizon_s: float = 100.0, seed: int = 0) -> None:
-    """Drive the ∞ with the paper's observer and with the delay line."""
+    """Run the ∞ with the paper's observer and with the delay line."""
     for name, observer in (("paper", None), ("delay line", f"{__name__}:DelayLine")):
         scenario = load_scenario("infinity", observer=observer, horizon_s=horizon_s)
         robots = run_policy(scenario, ReferencePolicy(), seed).metrics()

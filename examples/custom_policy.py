@@ -1,7 +1,7 @@
-"""A policy of one's own: pure pursuit of the previewed reference, with the ``predict`` of SB3.
+"""A user-defined policy: pure pursuit of the previewed reference, with the ``predict`` of SB3.
 
-Shows how to read a ``tracking`` observation by name, and that anything with this ``predict`` drives a
-formation: in a loop of one's own, in :func:`baselines.runs.run.run_policy`, and as ``others=`` of the
+It shows how to read entries of a ``tracking`` observation by name. Any object with this ``predict`` can
+drive a formation: in your own loop, in :func:`baselines.runs.run.run_policy`, and as ``others=`` of the
 Gymnasium environment.
 
     python examples/custom_policy.py --horizon-s 100
@@ -22,11 +22,11 @@ from tlf_env.task.observation import tracking_entries
 
 PREVIEW_S = (0.5, 1.0)  # the default of the scenarios
 SPEED_GAIN_PER_S = 0.5
-NEAREST_MM = 20.0  # a target closer than this says nothing about where to turn
+NEAREST_MM = 20.0  # lower bound of the distance to the target in the curvature
 
 
 class PurePursuit:
-    """Drive the arc through the place where the reference will be in half a second."""
+    """Drive along the arc through the position of the reference in half a second."""
 
     privileged = False
 
@@ -42,14 +42,14 @@ class PurePursuit:
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
-        """``twist`` actions for one observation or a batch of them; there is nothing to remember."""
-        seen = observation * self._scale  # physical units
+        """``twist`` actions for one observation or a batch; the policy has no state."""
+        values = observation * self._scale  # physical units
         speed = (
-            seen[..., self._place["reference_u_1"]]
-            + SPEED_GAIN_PER_S * seen[..., self._place["e_1"]]
+            values[..., self._place["reference_u_1"]]
+            + SPEED_GAIN_PER_S * values[..., self._place["e_1"]]
         )
-        forward = seen[..., self._place["forward_in_0.5_s"]]
-        right = seen[..., self._place["right_in_0.5_s"]]
+        forward = values[..., self._place["forward_in_0.5_s"]]
+        right = values[..., self._place["right_in_0.5_s"]]
         away = np.maximum(np.hypot(forward, right), NEAREST_MM)
         yaw_rate = -2.0 * speed * right / away**2  # positive turns left
         action = np.stack([speed / FULL_SPEED_MM_S, yaw_rate / FULL_YAW_RATE_RAD_S], axis=-1)
@@ -57,7 +57,7 @@ class PurePursuit:
 
 
 def main(horizon_s: float = 100.0, seed: int = 0) -> None:
-    """Drive the ∞ and the flower with the paper's law and with pure pursuit."""
+    """Run the ∞ and the flower with the paper's law and with pure pursuit."""
     for task in ("infinity", "flower"):
         scenario = load_scenario(task, horizon_s=horizon_s)
         for policy in (ReferencePolicy(), PurePursuit()):

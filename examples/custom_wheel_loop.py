@@ -1,7 +1,7 @@
-"""A wheel speed loop of one's own: PI with anti-windup by back-calculation.
+"""A user-defined wheel speed loop: PI with anti-windup by back-calculation.
 
-Shows the wheel loop's protocol (``factory(robot, period_s)``, ``reset``, ``torque``) and compares the
-loop with the paper's AVC. It runs on every robot, every millisecond.
+It shows the wheel loop protocol (``factory(robot, period_s)``, ``reset``, ``torque``) and compares the
+loop with the paper's AVC. The loop runs on every robot, every millisecond.
 
     python examples/custom_wheel_loop.py --horizon-s 100
     tlf run infinity --wheel-loop examples.custom_wheel_loop:PiLoop
@@ -23,7 +23,7 @@ UNWIND_PER_S = 20.0
 
 
 class PiLoop:
-    """Torque = gain·(error + ∫error/T); what the limit cuts off drains the integral."""
+    """Torque = gain·(error + ∫error/T); the torque cut off by the limit reduces the integral."""
 
     def __init__(self, robot: RobotParameters, period_s: float) -> None:
         self._limit = robot.torque_limit_Nmm
@@ -45,7 +45,7 @@ class PiLoop:
 
 
 def main(horizon_s: float = 100.0, seed: int = 0) -> None:
-    """Drive the ∞ with the AVC and with the loop above."""
+    """Run the ∞ with the AVC and with the loop above."""
     for name, wheel_loop in (("AVC", None), ("PI", f"{__name__}:PiLoop")):
         scenario = load_scenario("infinity", wheel_loop=wheel_loop, horizon_s=horizon_s)
         robots = run_policy(scenario, ReferencePolicy(), seed).metrics()

@@ -1,9 +1,9 @@
-"""The wheel loop by the book: the plant linearised, python-control, margins and a Bode plot.
+"""Linear analysis of the wheel loop with python-control: linearised plant, margins and a Bode plot.
 
-Driving straight, the two wheels are two decoupled loops: the *common* mode (both wheels alike, the
-robot speeds up) and the *differential* mode (against each other, it turns). The paper designs its AVC
-on one wheel that carries 0.4 of the mass, eq. (6); here both true modes are printed beside it, for the
-loop as it runs: a zero-order hold every millisecond.
+On a straight path the two wheels form two decoupled loops: the *common* mode (equal torques, the robot
+accelerates) and the *differential* mode (opposite torques, it turns). The paper designs its AVC for one
+wheel that carries 0.4 of the mass, eq. (6). This script prints the margins for that plant and for both
+modes, with the loop as implemented: a zero-order hold every millisecond.
 
     python examples/linear_design.py --figure bode.png
 """
@@ -32,7 +32,7 @@ def paper_plant(robot: RobotParameters) -> control.StateSpace:
 
 
 def mode(plant: LinearPlant, states: slice, sign: float) -> control.StateSpace:
-    """One mode of the wheels: torques (sign·τ, τ) to the mean of (sign·ω_l, ω_r)."""
+    """One mode of the wheels, from torques (sign·τ, τ) to the mean of (sign·ω_l, ω_r)."""
     together = np.array([sign, 1.0])
     return control.ss(
         plant.A[states, states],
@@ -50,7 +50,7 @@ def avc(p: WheelLoopParameters) -> control.StateSpace:
 
 
 def report(name: str, plant: control.StateSpace, loop: control.StateSpace) -> None:
-    """Print what the loop makes of a plant."""
+    """Print the margins of the loop with a plant."""
     open_loop = control.sample_system(loop, PERIOD_S) * control.sample_system(plant, PERIOD_S)
     response = control.frequency_response(open_loop, np.geomspace(0.01, np.pi / PERIOD_S, 2000))
     _, phase, _, _, crossover, _ = control.stability_margins(response)
@@ -64,7 +64,7 @@ def report(name: str, plant: control.StateSpace, loop: control.StateSpace) -> No
 
 
 def main(speed_mm_s: float = 300.0, figure: Path | None = None) -> None:
-    """Print the margins of the wheel loop; draw the open loops if a file is named."""
+    """Print the margins of the wheel loop; with ``figure``, draw the open loops to that file."""
     robot, loop = RobotParameters(), avc(WheelLoopParameters())
     straight = linearise(robot, speed_mm_s)
     plants = {

@@ -1,7 +1,7 @@
-"""One robot learns, the paper's controller drives the others: the Gymnasium API in one loop.
+"""The Gymnasium API in one loop: one robot learns, the paper's controller drives the others.
 
-The learner is the first follower; its action is added to the reference's twist, so that an action of
-zero is the reference itself and random actions show what a bad policy costs.
+The learner is the first follower. Its action is a *residual*: it is added to the twist of the reference
+controller. An action of zero gives the reference itself; random actions show the effect of a bad policy.
 
     python examples/quickstart_gymnasium.py --horizon-s 30
 """
@@ -16,7 +16,7 @@ import tlf_env  # noqa: F401  registers the environments
 
 
 def episode_return(env: gymnasium.Env, *, random: bool, seed: int) -> tuple[float, str]:
-    """Return of one episode with actions drawn at random or all zero, and why it ended."""
+    """Return of one episode with random or zero actions, and the reason for its end."""
     env.reset(seed=seed)
     env.action_space.seed(seed)
     total, over = 0.0, False
@@ -29,7 +29,7 @@ def episode_return(env: gymnasium.Env, *, random: bool, seed: int) -> tuple[floa
 
 
 def main(horizon_s: float = 30.0, seed: int = 0) -> None:
-    """Compare no correction with random ones."""
+    """Compare zero with random residuals."""
     env = gymnasium.make(
         "tlf_env/Infinity-v0", learner="robot_1", action="residual", horizon_s=horizon_s
     )

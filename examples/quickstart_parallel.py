@@ -1,6 +1,6 @@
-"""Three robots on the ∞, every one an agent: the PettingZoo parallel API in one loop.
+"""The PettingZoo parallel API in one loop: three robots on the ∞, each of them an agent.
 
-Shows reset, step, what ``info`` tells, and a policy that sees observations only.
+It shows reset, step, the content of ``info``, and a policy that uses only observations.
 
     python examples/quickstart_parallel.py --horizon-s 30
 """
@@ -14,13 +14,15 @@ from baselines import ReferencePolicy
 
 
 def main(horizon_s: float = 30.0, seed: int = 0) -> None:
-    """Drive the paper's controller to the end of an episode and print each robot's error."""
+    """Run the paper's controller to the end of an episode and print the error of each robot."""
     env = tlf_env.parallel_env("infinity", horizon_s=horizon_s)
     policy = ReferencePolicy()
     observations, infos = env.reset(seed=seed)
     returns = dict.fromkeys(env.agents, 0.0)
     while env.agents:
-        actions = {agent: policy.predict(seen)[0] for agent, seen in observations.items()}
+        actions = {
+            agent: policy.predict(observation)[0] for agent, observation in observations.items()
+        }
         observations, rewards, _terminated, _truncated, infos = env.step(actions)
         for agent, reward in rewards.items():
             returns[agent] += reward

@@ -1,9 +1,10 @@
-"""SB3's PPO on many formations at once: a starting point, not a result.
+"""SB3's PPO on many formations at once: a starting point for your own training.
 
-Every robot of every formation is a sub-environment, and one policy learns for all of them. What it does is
-added to the twist of the tuned reference, before that reference's limits, so that it begins as the
-reference. The default trains for a few seconds and shows that everything fits together; a million robot
-steps take about two minutes. The policy is written without torch's files, for ``tlf run --policy``.
+Every robot of every formation is a sub-environment, and one policy is trained for all of them. Its action
+is a *residual*: it is added to the twist of the tuned reference, before the limits of that reference, so
+the initial policy is close to the reference. The default trains for a few seconds, as a check; a million
+robot steps take about two minutes. The policy is written in the format of ``tlf run --policy``, which does
+not need torch.
 
     pip install 'tlf-env[train]'
     python examples/train_ppo.py --robot-steps 1000000 --out results/follower.safetensors
@@ -24,11 +25,11 @@ from baselines.sb3 import FormationVecEnv
 from baselines.training.export import export_policy
 from tlf_env import load_scenario
 
-JUDGED_FROM_SEED = 10_000  # other draws than those of the training
+EVALUATION_SEED = 10_000  # random draws that differ from those of the training
 
 
 class NoResidual:
-    """The reference itself: a residual of zero."""
+    """A residual of zero: the reference itself."""
 
     def predict(
         self,
@@ -41,14 +42,16 @@ class NoResidual:
         return np.zeros((len(observation), 2), observation.dtype), state
 
 
-def judge(policy: Any, env: FormationVecEnv) -> float:
-    """Mean reward of a robot and step over one episode of the same seeds for everybody."""
-    env.seed(JUDGED_FROM_SEED)
-    seen, rewards = env.reset(), []
+def evaluate(policy: Any, env: FormationVecEnv) -> float:
+    """Mean reward per robot and step over one episode, with the same seeds for all policies."""
+    env.seed(EVALUATION_SEED)
+    observations, rewards = env.reset(), []
     done = np.zeros(env.num_envs, dtype=bool)
     while not done.all():
-        seen, reward, ended, _ = env.step(policy.predict(seen, deterministic=True)[0])
-        rewards.append(np.where(done, 0.0, reward))  # what comes after the end is another episode
+        observations, reward, ended, _ = env.step(
+            policy.predict(observations, deterministic=True)[0]
+        )
+        rewards.append(np.where(done, 0.0, reward))  # after the end the next episode has begun
         done |= ended
     return float(np.mean(rewards))
 
@@ -61,7 +64,7 @@ def main(
     seed: int = 0,
     out: Path | None = None,
 ) -> None:
-    """Train, and compare the rewards before and after with the reference's."""
+    """Train, and compare the mean reward with that of the reference."""
     scenario = load_scenario(
         "infinity",
         disturbance=disturbance,
@@ -85,10 +88,10 @@ def main(
         seed=seed,
         device="cpu",
     )
-    model.policy.action_net.weight.data.mul_(0.1)  # begin as the reference
-    print(f"reference: mean reward {judge(NoResidual(), tests):.4f}")
+    model.policy.action_net.weight.data.mul_(0.1)  # start close to the reference
+    print(f"reference: mean reward {evaluate(NoResidual(), tests):.4f}")
     model.learn(robot_steps)
-    print(f"after {model.num_timesteps} robot steps: mean reward {judge(model, tests):.4f}")
+    print(f"after {model.num_timesteps} robot steps: mean reward {evaluate(model, tests):.4f}")
     if out is not None:
         export_policy(
             model,

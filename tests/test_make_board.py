@@ -110,8 +110,8 @@ def other_seeds(path: Path) -> None:
     [
         ("leaderboard.json", Path.unlink, "no leaderboard.json; run: tlf bench --plan board"),
         ("runs.jsonl", Path.unlink, "no runs.jsonl"),
-        ("runs.jsonl", cut_last_line, "1 of 12 episodes are missing, the first"),
-        ("plan.json", other_seeds, "not that of plan.json"),
+        ("runs.jsonl", cut_last_line, "1 of 12 episodes are missing, the first is"),
+        ("plan.json", other_seeds, "does not belong to plan.json"),
     ],
 )
 def test_results_that_miss_something_are_refused_and_nothing_is_written(
@@ -161,7 +161,7 @@ def test_the_best_of_a_column_fails_least_and_then_errs_least():
     assert shown[2:] == ["**3.0**", "**3.0**", "0.5 (1)", "(50)", "(100)"]  # a tie as it is shown
 
 
-def test_nobody_is_best_where_all_runs_fail():
+def test_no_policy_is_best_where_all_runs_fail():
     best = make_board.standing(cell("a", 100, 2000.0))
     assert make_board.shown(cell("a", 100, 2000.0), best) == "(100)"
 

@@ -1,7 +1,7 @@
-"""Write ``docs/leaderboard.md``, ``docs/leaderboard/`` and the README's tables from a benchmark's results.
+"""Write ``docs/leaderboard.md``, ``docs/leaderboard/`` and the README's tables from benchmark results.
 
-``tlf bench --plan board --out results/board`` runs it; then call this as
-``python docs/figures/make_board.py results/board``. It needs the extras ``bench`` and ``figures``.
+First run ``tlf bench --plan board --out results/board``, then
+``python docs/figures/make_board.py results/board``. This needs the extras ``bench`` and ``figures``.
 The same results give the same files, byte for byte.
 """
 
@@ -22,7 +22,7 @@ from tlf_env.task.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-TELLING = ("nominal", "noise", "slip", "ice", "start", "combined-hard")  # shown in the README
+README_DISTURBANCES = ("nominal", "noise", "slip", "ice", "start", "combined-hard")
 TASK_NAMES = {"infinity": "∞", "flower": "Flower"}
 BEGIN, END = "<!-- board -->", "<!-- end of board -->"
 METRIC = "position_rmse_mm"
@@ -32,12 +32,12 @@ Line = dict[str, Any]
 
 
 def read_results(folder: Path) -> tuple[Board, list[Line]]:
-    """What ``tlf bench`` has written: the tables' numbers, and a line for each episode of the plan.
+    """Read the output of ``tlf bench``: the leaderboard, and one line per episode of the plan.
 
     Raises
     ------
     ValueError
-        if a file is missing, episodes are missing, or the tables are of another plan.
+        if a file or an episode is missing, or the leaderboard belongs to another plan.
     """
     hint = f"tlf bench --plan board --out {folder}"
     for name in (PLAN, RUNS, "leaderboard.json"):
@@ -46,7 +46,7 @@ def read_results(folder: Path) -> tuple[Board, list[Line]]:
     board = json.loads((folder / "leaderboard.json").read_text("utf-8"))
     made = json.loads((folder / PLAN).read_text("utf-8"))
     if board["plan"] != made or "comparisons" not in board:
-        raise ValueError(f"{folder}/leaderboard.json is not that of {PLAN}; run again: {hint}")
+        raise ValueError(f"{folder}/leaderboard.json does not belong to {PLAN}; run again: {hint}")
     texts = (folder / RUNS).read_text("utf-8").splitlines()
     lines = {Cell(*(line[name] for name in Cell._fields)): line for line in map(json.loads, texts)}
     wanted = plan_of(board).cells()
@@ -54,32 +54,32 @@ def read_results(folder: Path) -> tuple[Board, list[Line]]:
     if missing:
         first = ", ".join(str(part) for part in missing[0] if part is not None)
         raise ValueError(
-            f"{folder}: {len(missing)} of {len(wanted)} episodes are missing, the first {first}; "
+            f"{folder}: {len(missing)} of {len(wanted)} episodes are missing, the first is {first}; "
             f"run again: {hint}"
         )
     return board, [lines[cell] for cell in wanted]
 
 
 def plan_of(board: Board) -> Plan:
-    """The plan that a leaderboard is of.
+    """The plan of a leaderboard.
 
     Raises
     ------
     ValueError
-        if a knob was swept.
+        if the plan has a sweep.
     """
-    told = board["plan"]["plan"]
-    if told["sweep"] is not None:
-        raise ValueError(f"a sweep of {told['sweep']} makes no leaderboard")
+    plan = board["plan"]["plan"]
+    if plan["sweep"] is not None:
+        raise ValueError(f"sweep {plan['sweep']}: a leaderboard needs a plan without a sweep")
     return Plan(
-        **{name: tuple(told[name]) for name in ("policies", "tasks", "disturbances", "seeds")},
-        level=told["level"],
-        overrides=tuple(tuple(pair) for pair in told["overrides"]),
+        **{name: tuple(plan[name]) for name in ("policies", "tasks", "disturbances", "seeds")},
+        level=plan["level"],
+        overrides=tuple(tuple(pair) for pair in plan["overrides"]),
     )
 
 
 def slice_of(board: Board, lines: list[Line]) -> list[Line]:
-    """An episode for each policy and task, at the first seed, over as many disturbances as there are.
+    """One episode per policy and task, at the first seed, spread over the disturbances.
 
     Tests run these again.
     """
@@ -97,18 +97,18 @@ def slice_of(board: Board, lines: list[Line]) -> list[Line]:
 
 
 def failures(cell: dict[str, Any]) -> int:
-    """Runs of a cell that fail."""
+    """Number of failed runs of a cell."""
     return int(cell["runs"] - cell["success"]["count"])
 
 
 def standing(cell: dict[str, Any]) -> tuple[int, float]:
-    """What ranks policies in a cell, as shown: failures, then the error to a tenth of a millimetre."""
+    """Sort key of a cell: failures, then the error rounded to 0.1 mm, as displayed."""
     error = cell[METRIC]["median"]
     return failures(cell), math.inf if error is None else round(error, 1)
 
 
 def shown(cell: dict[str, Any], best: tuple[int, float]) -> str:
-    """A cell of the README's table."""
+    """Text of a cell of the README's table."""
     failed, runs = failures(cell), cell["runs"]
     error = number(cell[METRIC]["median"], 1)
     if not failed:
@@ -121,10 +121,10 @@ def shown(cell: dict[str, Any], best: tuple[int, float]) -> str:
 
 
 def readme_table(board: Board, task: str) -> str:
-    """Policies by score, against the disturbances that tell most."""
+    """The README's table of a task: policies by score, and selected disturbances."""
     plan = board["plan"]["plan"]
-    columns = [name for name in TELLING if name in plan["disturbances"]]
-    columns = columns or plan["disturbances"][: len(TELLING)]
+    columns = [name for name in README_DISTURBANCES if name in plan["disturbances"]]
+    columns = columns or plan["disturbances"][: len(README_DISTURBANCES)]
     cells = {
         (cell["policy"], cell["disturbance"]): cell
         for cell in board["cells"]
@@ -140,25 +140,25 @@ def readme_table(board: Board, task: str) -> str:
     ]
     for row in board["policies"]:
         name = row["policy"]
-        told = [shown(cells[name, column], best[column]) for column in columns]
-        out.append(f"| `{name}` | {' | '.join(told)} | {row['score']['iqm']:.1f} |")
+        texts = [shown(cells[name, column], best[column]) for column in columns]
+        out.append(f"| `{name}` | {' | '.join(texts)} | {row['score']['iqm']:.1f} |")
     return "\n".join(out)
 
 
 def readme_part(board: Board) -> str:
-    """Everything between the README's markers."""
+    """The text between the README's markers."""
     plan = board["plan"]["plan"]
     first, end = plan["seeds"]
     horizon = dict(map(tuple, plan["overrides"])).get("horizon_s")
     length = "" if horizon is None else f" of {horizon:g} s"
     tables = "\n\n".join(readme_table(board, task) for task in plan["tasks"])
     return (
-        f"The worst robot's position RMS in mm, median over {end - first} runs{length}; in brackets how "
-        "many of them *fail* (a robot is lost or touches another), alone where half do. **Bold**: the "
-        "fewest failures, then the smallest error. The score goes over all tasks and "
-        f"{len(plan['disturbances'])} disturbances.\n\n"
+        f"Position RMS of the worst robot in mm, median over {end - first} runs{length}. In brackets: the "
+        "number of *failed* runs (a robot is lost or touches another); if at least half fail, only this "
+        "number is given. **Bold**: fewest failures, then smallest error. Score: interquartile mean (IQM) "
+        f"from 0 to 100 over all tasks and {len(plan['disturbances'])} disturbances.\n\n"
         f"{tables}\n\n"
-        "All disturbances, intervals, and the command that makes it: "
+        "All disturbances, intervals, and the command that reproduces them: "
         "[docs/leaderboard.md](docs/leaderboard.md)."
     )
 
@@ -166,12 +166,12 @@ def readme_part(board: Board) -> str:
 def with_part(
     text: str, part: str, begin: str = BEGIN, end: str = END, page: str = "README.md"
 ) -> str:
-    """A page with what is between its markers made anew.
+    """A page with the text between its markers replaced.
 
     Raises
     ------
     ValueError
-        if it has not one of each marker, in their order.
+        if the page does not contain each marker once, in order.
     """
     if text.count(begin) != 1 or text.count(end) != 1 or text.index(end) < text.index(begin):
         raise ValueError(f"{page} must have one line {begin!r} and, after it, one {end!r}")
@@ -180,18 +180,18 @@ def with_part(
 
 
 def write_text(path: Path, text: str) -> None:
-    """Write a file whole or not at all."""
+    """Write a file atomically."""
     with atomic(path, "wb") as file:
         file.write(text.encode())
 
 
 def write_board(results: Path, root: Path = ROOT) -> None:
-    """Write everything under ``root``, the checkout.
+    """Write all pages under ``root``, the checkout.
 
     Raises
     ------
     ValueError
-        as :func:`read_results` and :func:`with_part` do, before anything is written.
+        as in :func:`read_results` and :func:`with_part`, before any file is written.
     """
     board, lines = read_results(results)
     readme = with_part((root / "README.md").read_text("utf-8"), readme_part(board))
@@ -207,13 +207,13 @@ def write_board(results: Path, root: Path = ROOT) -> None:
 
 
 def main() -> None:
-    """Read the command line."""
+    """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
-    parser.add_argument("results", type=Path, help="the folder that tlf bench has written")
-    parser.add_argument("--root", type=Path, default=ROOT, help="write there instead")
-    asked = parser.parse_args()
+    parser.add_argument("results", type=Path, help="output folder of tlf bench")
+    parser.add_argument("--root", type=Path, default=ROOT, help="checkout to write to")
+    options = parser.parse_args()
     try:
-        write_board(asked.results, asked.root)
+        write_board(options.results, options.root)
     except ValueError as error:
         sys.exit(f"make_board: {error}")
 

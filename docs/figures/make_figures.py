@@ -1,7 +1,7 @@
-"""Draw the figures of ``docs/physics.md`` and ``docs/controller.md`` from the project's own numbers.
+"""Draw ``robot.svg`` and ``wheel_loop.svg`` from the parameters of the default robot and wheel loop.
 
-Run it as ``python docs/figures/make_figures.py``; it needs the extra ``figures``. It writes
-``robot.svg`` and ``wheel_loop.svg`` beside itself.
+Run ``python docs/figures/make_figures.py``. This needs the extra ``figures``. The files are written to the
+folder of this script.
 """
 
 from __future__ import annotations
@@ -32,8 +32,8 @@ STYLE = {
 BLUE, ORANGE, GREEN, RED, GREY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "0.45"
 
 ROBOT = RobotParameters()
-CASTOR_ANGLE = 0.5  # rad, for the picture
-DRIVE_WIDTH_MM, CASTOR_WIDTH_MM = 22.0, 14.0  # for the picture
+CASTOR_ANGLE = 0.5  # rad, for the drawing
+DRIVE_WIDTH_MM, CASTOR_WIDTH_MM = 22.0, 14.0  # for the drawing
 
 KAPPA = 1 / (
     ROBOT.drive_load_share * ROBOT.mass_kg * ROBOT.wheel_radius_mm**2 + ROBOT.wheel_inertia_kg_mm2
@@ -41,13 +41,13 @@ KAPPA = 1 / (
 
 
 def save(figure: Figure, name: str) -> None:
-    """Write a figure as SVG that is the same at every run."""
+    """Write a figure as a reproducible SVG."""
     with atomic(FOLDER / f"{name}.svg", "wb") as file:
         figure.savefig(file, format="svg", metadata={"Date": None}, facecolor="white")
 
 
 def arrow(axes: Axes, tail: tuple[float, float], tip: tuple[float, float], colour: str) -> None:
-    """A vector."""
+    """Draw a vector."""
     axes.annotate(
         "", tip, tail, arrowprops={"arrowstyle": "-|>", "color": colour, "lw": 1.4, "shrinkA": 0}
     )
@@ -56,7 +56,7 @@ def arrow(axes: Axes, tail: tuple[float, float], tip: tuple[float, float], colou
 def dimension(
     axes: Axes, tail: tuple[float, float], tip: tuple[float, float], label: str, side: float
 ) -> None:
-    """A dimension line with its label to one side (mm) of its middle."""
+    """Draw a dimension line; its label is ``side`` (mm) away from its middle."""
     style = {"arrowstyle": "<->", "color": GREY, "lw": 0.9, "shrinkA": 0, "shrinkB": 0}
     axes.annotate("", tip, tail, arrowprops=style)
     along = np.subtract(tip, tail) / math.dist(tip, tail)
@@ -67,21 +67,21 @@ def dimension(
 def wheel(
     axes: Axes, centre: tuple[float, float], radius: float, width: float, turn: float
 ) -> None:
-    """A wheel seen from above."""
+    """Draw a wheel, seen from above."""
     shape = Rectangle((-width / 2, -radius), width, 2 * radius, fc="0.85", ec="black", zorder=2)
     shape.set_transform(Affine2D().rotate(turn).translate(*centre) + axes.transData)
     axes.add_patch(shape)
 
 
 def point(axes: Axes, place: tuple[float, float], label: str, offset: tuple[float, float]) -> None:
-    """A named point; the label lies to the left where ``offset`` (points) does."""
+    """Draw a named point; the label is to the left if ``offset`` (points) is."""
     axes.plot(*place, "o", color="black", ms=4, zorder=5)
     side = "right" if offset[0] < 0 else "left"
     axes.annotate(label, place, offset, textcoords="offset points", ha=side, zorder=5)
 
 
 def robot() -> Figure:
-    """The robot from above: points, lengths, axes and the castor's angle."""
+    """Draw the robot from above: points, lengths, axes and the angle of the castor."""
     p = ROBOT
     figure = Figure(figsize=(6.4, 6.0), layout="constrained")
     axes = figure.subplots()
@@ -115,7 +115,7 @@ def robot() -> Figure:
         tip = contact + 52 * vector
         arrow(axes, contact, tuple(tip), GREEN)
         axes.text(*(contact + 60 * vector), label, color=GREEN, ha="center", va="center")
-    # The fork's angle, from straight back.
+    # The angle of the fork, measured from straight back.
     axes.plot([0, 0], [pivot[1], pivot[1] - 66], color=GREY, lw=0.8, ls=":")
     end = pivot - 66 * along
     axes.plot([pivot[0], end[0]], [pivot[1], end[1]], color=GREY, lw=0.8, ls=":")
@@ -153,7 +153,7 @@ def robot() -> Figure:
 
 
 def wheel_loop() -> Figure:
-    """The paper's design conditions, and the Nyquist curve of the digital loop that runs."""
+    """Draw the paper's design conditions, and Nyquist curves of the implemented digital loop."""
     figure = Figure(figsize=(10.0, 4.2), layout="constrained")
     design, nyquist = figure.subplots(1, 2, width_ratios=[1.15, 1])
     conditions(design)
@@ -162,7 +162,7 @@ def wheel_loop() -> Figure:
 
 
 def conditions(axes: Axes) -> None:
-    """Eqs (9)–(11) over frequency, for the slow loop with K in kg·mm²/s² per rad/s."""
+    """Plot eqs (9)–(11) over frequency, for the slow loop with K in kg·mm²/s² per rad/s."""
     s = control.tf("s")
     loop = WheelLoopParameters()
     K = loop.gain_Nmm_s * (s**2 + loop.zeros_1 * s + loop.zeros_0) / (s * (s + loop.pole_rad_s))
@@ -188,7 +188,7 @@ def conditions(axes: Axes) -> None:
 
 
 def running_loops(axes: Axes) -> None:
-    """L(e^jωT) of the running loop for two periods and two delays; circles: modulus margins."""
+    """Plot L(e^jωT) of the implemented loop for two periods and two delays; circles: modulus margins."""
     cases = ((0.001, 0, BLUE, "-"), (0.001, 1, GREEN, "--"), (0.005, 1, RED, "-."))
     for period_s, delay, colour, dashes in cases:
         L = running_loop(period_s, delay)

@@ -1,8 +1,8 @@
-"""Put trainings into ``docs/learning.md``: their table, learning curves, and the curves' numbers.
+"""Write the table of trainings and the learning curves of ``docs/learning.md``.
 
-``tlf train NAME --seeds 0,1,2`` trains; then call this as
-``python docs/figures/make_learning.py results/train/residual results/train/direct``. It needs the extra
-``figures``. What ran is kept in ``docs/learning/``, from which a call without folders draws again.
+First run ``tlf train NAME --seeds 0,1,2``, then
+``python docs/figures/make_learning.py results/train/residual results/train/direct``. This needs the extra
+``figures``. The curves are copied to ``docs/learning/``; without folders the script uses these copies.
 """
 
 from __future__ import annotations
@@ -30,7 +30,13 @@ Curve = dict[str, Any]
 
 
 def keep(folder: Path) -> None:
-    """Copy the curves of a training's seeds."""
+    """Copy the curves of all seeds of a training to ``docs/learning/``.
+
+    Raises
+    ------
+    ValueError
+        if the folder has no curves.
+    """
     found = sorted(folder.glob("seed_*/curve.json"))
     if not found:
         raise ValueError(f"{folder} has no seed_N/curve.json; run tlf train first")
@@ -45,7 +51,7 @@ def keep(folder: Path) -> None:
 
 
 def kept_curves() -> dict[str, list[Curve]]:
-    """All curves by the name of their training."""
+    """All copied curves by the name of their training."""
     curves: dict[str, list[Curve]] = {}
     for path in sorted(KEPT.glob("*-*.json")):
         name = path.stem.rpartition("-")[0]
@@ -59,7 +65,7 @@ def best(curve: Curve) -> dict[str, Any]:
 
 
 def trainings(curves: dict[str, list[Curve]]) -> str:
-    """The table: a row for each seed."""
+    """The table of trainings: one row per seed."""
     head = ["training", "seed", "score at the start", "kept", "failed", "at robot steps", "minutes"]
     rows = []
     for name, seeds in curves.items():
@@ -81,7 +87,7 @@ def trainings(curves: dict[str, list[Curve]]) -> str:
 
 
 def draw(curves: dict[str, list[Curve]], path: Path) -> None:
-    """Score on the choosing seeds, and mean reward while training, against robot steps."""
+    """Draw the score on the validation seeds and the mean reward of the training against robot steps."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")
         left, right = figure.subplots(1, 2)
@@ -101,7 +107,9 @@ def draw(curves: dict[str, list[Curve]], path: Path) -> None:
             left.axhline(
                 start["evaluations"][0]["score_mm"], color=GREY, ls="--", label="tuned reference"
             )
-        left.set(xlabel="robot steps, millions", ylabel="score on choosing seeds, mm", yscale="log")
+        left.set(
+            xlabel="robot steps, millions", ylabel="score on validation seeds, mm", yscale="log"
+        )
         right.set(xlabel="robot steps, millions", ylabel="mean reward of a robot and step")
         left.set_yticks(TICKS_MM, [f"{tick:g}" for tick in TICKS_MM])
         left.minorticks_off()
@@ -110,7 +118,7 @@ def draw(curves: dict[str, list[Curve]], path: Path) -> None:
 
 
 def main(folders: list[str]) -> None:
-    """Keep the folders' curves, then write table and figure from all that are kept."""
+    """Copy the curves of the folders, then write table and figure from all copies."""
     for folder in folders:
         keep(Path(folder))
     curves = kept_curves()

@@ -1,7 +1,7 @@
-"""Put the numbers of ``docs/performance.json`` into ``docs/performance.md`` and draw ``speed.svg``.
+"""Write the numbers of ``docs/performance.json`` into ``docs/performance.md`` and draw ``speed.svg``.
 
-``tlf speed --out docs/performance.json`` measures them; then run this as
-``python docs/figures/make_speed.py``. It needs the extra ``figures``.
+First run ``tlf speed --out docs/performance.json``, then ``python docs/figures/make_speed.py``. This needs
+the extra ``figures``.
 """
 
 from __future__ import annotations
@@ -25,15 +25,15 @@ MPE2, VMAS, ALONE, VECTOR = (
 PART_NAMES = {
     "plant": "wheel loops and plant, 20 substeps",
     "onboard": "encoders, position fixes, EKF, 20 substeps",
-    "actions": "actions, reference's law, who is near",
+    "actions": "actions, reference controller, search for near robots",
     "radio": "radio, observer, references",
     "observation_reward_info": "errors, reward, observation, info",
-    "api": "Gymnasium's interface: arrays copied and named",
+    "api": "Gymnasium interface: copying and naming arrays",
 }
 
 
 def rows_of(result: dict[str, Any], env: str, **fields: int) -> list[dict[str, Any]]:
-    """Results of an environment with these fields."""
+    """Results of an environment, filtered by fields."""
     return [
         row
         for row in result["results"]
@@ -42,13 +42,13 @@ def rows_of(result: dict[str, Any], env: str, **fields: int) -> list[dict[str, A
 
 
 def number(value: float) -> str:
-    """Three figures, thousands parted."""
+    """A number with three significant digits and thousands separated by spaces."""
     digits = len(str(round(value)))
     return f"{round(value, min(0, 3 - digits)):,.0f}".replace(",", " ")
 
 
 def table(head: list[str], rows: list[list[str]], names: int = 1) -> str:
-    """A Markdown table; the first columns are names, the others numbers."""
+    """A Markdown table; the first ``names`` columns are text, the others numbers."""
     line = "|" + "|".join(["---"] * names + ["---:"] * (len(head) - names)) + "|"
     first, *others = [f"| {' | '.join(row)} |" for row in (head, *rows)]
     return "\n".join([first, line, *others])
@@ -64,7 +64,7 @@ def ratio(result: dict[str, Any], row: dict[str, Any], to: str) -> str:
 
 
 def machine(result: dict[str, Any]) -> str:
-    """What it was measured on."""
+    """The machine and the versions of the measurement."""
     about, found = result["machine"], result["versions"]
     versions = ", ".join(f"{name} {value}" for name, value in found.items())
     return (
@@ -75,7 +75,7 @@ def machine(result: dict[str, Any]) -> str:
 
 
 def speeds(result: dict[str, Any]) -> str:
-    """Agent steps per second of everything."""
+    """Agent steps per second of all environments."""
     body = []
     for env in (ALONE, VECTOR, VMAS, MPE2):
         for row in rows_of(result, env):
@@ -99,7 +99,7 @@ def speeds(result: dict[str, Any]) -> str:
 
 
 def parts(result: dict[str, Any]) -> str:
-    """Where the time goes."""
+    """Time of each part of a step."""
     found = result["parts"]
     head = ["µs per formation step", *(f"{one['robots']} robots" for one in found)]
     body = [
@@ -120,13 +120,19 @@ def scaling(result: dict[str, Any]) -> str:
 
 
 def memory(result: dict[str, Any]) -> str:
-    """Memory of a formation."""
+    """Memory of a formation by its number of robots."""
     found = result["memory_per_formation_bytes"]
     return "; ".join(f"{value / 1000:.0f} kB with {n} robots" for n, value in found.items()) + "."
 
 
 def written(text: str, result: dict[str, Any]) -> str:
-    """A page with everything between its markers made anew."""
+    """The page with the text between all markers replaced.
+
+    Raises
+    ------
+    ValueError
+        if the page does not contain each marker once.
+    """
     for make in (machine, speeds, parts, scaling, memory):
         mark = f"<!-- {make.__name__} -->"
         if text.count(mark) != 1:
@@ -142,11 +148,11 @@ def speed(result: dict[str, Any]) -> Figure:
     axes = figure.subplots()
     lines = [
         (VECTOR, 3, 1, BLUE, "-", "o", "tlf_env, 3 robots"),
-        (VECTOR, 3, 2, BLUE, "--", "o", "the same, 2 threads"),
+        (VECTOR, 3, 2, BLUE, "--", "o", "tlf_env, 3 robots, 2 threads"),
         (VECTOR, 5, 1, ORANGE, "-", "s", "tlf_env, 5 robots"),
-        (VECTOR, 5, 2, ORANGE, "--", "s", "the same, 2 threads"),
+        (VECTOR, 5, 2, ORANGE, "--", "s", "tlf_env, 5 robots, 2 threads"),
         (VMAS, 3, 1, GREEN, "-", "^", "VMAS DiffDrive, 3 agents"),
-        (VMAS, 3, 2, GREEN, "--", "^", "the same, 2 threads"),
+        (VMAS, 3, 2, GREEN, "--", "^", "VMAS DiffDrive, 2 threads"),
     ]
     for env, robots, threads, colour, dashes, marker, label in lines:
         rows = rows_of(result, env, robots=robots, threads=threads)
@@ -188,7 +194,7 @@ def speed(result: dict[str, Any]) -> Figure:
     axes.set_xticks(counts, [f"{count:,}".replace(",", " ") for count in counts])
     axes.minorticks_off()
     axes.grid(which="major", color="0.9", lw=0.6)
-    axes.set_xlabel("formations side by side")
+    axes.set_xlabel("formations")
     axes.set_ylabel("agent steps per second (1/s)")
     axes.legend(frameon=False, fontsize=9, loc="upper left")
     return figure
