@@ -1,4 +1,4 @@
-"""Draw the figures of ``docs/physics.md`` and ``docs/controller.md`` from the project's own numbers.
+"""Draw the figures of ``docs/physics.md`` and ``docs/controller/paper.md`` from the project's own numbers.
 
 Run it as ``python docs/figures/make_figures.py``; it needs the extra ``figures``. It writes
 ``robot.svg`` and ``wheel_loop.svg`` beside itself.
