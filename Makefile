@@ -31,6 +31,8 @@ check: $(VENV)/.stamp-test ## Lint, check format and types
 	$(BIN)/ruff check
 	$(BIN)/ruff format --check
 	$(BIN)/mypy
+	$(BIN)/lint-imports --no-cache
+	$(BIN)/codespell
 
 format: $(VENV)/.stamp-test ## Sort the imports and format the sources
 	$(BIN)/ruff check --select I --fix

@@ -1,4 +1,4 @@
-"""Draw ``robot.svg`` and ``wheel_loop.svg`` from the parameters of the default robot and wheel loop.
+"""Draw the figures of docs/physics.md and docs/controller/paper.md: robot.svg and wheel_loop.svg.
 
 Run ``python docs/figures/make_figures.py``. This needs the extra ``figures``. The files are written to the
 folder of this script.

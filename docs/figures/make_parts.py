@@ -1,11 +1,13 @@
-"""What each part of `tuned` does: leave one out, drive ∞ anew, put the tables into ``docs/controller.md``.
+"""What each part of `tuned` does: leave one out and drive ∞.
 
+Writes the tables of ``docs/controller/slip-estimator.md`` and ``docs/controller/limits-and-spacing.md``.
 ``python docs/figures/make_parts.py`` drives 16 seeds of each disturbance for 60 s; it takes some minutes
 and needs no extra.
 """
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -28,15 +30,15 @@ WITHOUT_LEARNING = {
 WITHOUT_WHEELS = {"most_acceleration_mm_s2": None, "most_yaw_acceleration_rad_s2": None}
 WITHOUT_SURPRISE = {"surprise_threshold": None}
 FILTERS: dict[str, dict[str, Any]] = {
-    "whole": {},
-    "wheels tell nothing": {"ekf_slip": WITHOUT_WHEELS},
-    "without surprise": {"ekf_slip": WITHOUT_SURPRISE},
-    "variance of a fix fixed, 2.1 mm²": {"ekf_slip": WITHOUT_LEARNING},
+    "complete filter": {},
+    "no jumps of the wheel speed": {"ekf_slip": WITHOUT_WHEELS},
+    "no innovation test": {"ekf_slip": WITHOUT_SURPRISE},
+    "fixed variance of the fixes, 2.1 mm²": {"ekf_slip": WITHOUT_LEARNING},
     "none of the three": {"ekf_slip": {**WITHOUT_LEARNING, **WITHOUT_SURPRISE, **WITHOUT_WHEELS}},
-    "the true pose and slip": {"estimator": "truth"},
+    "true pose and slip": {"estimator": "truth"},
 }
 LAWS: dict[str, dict[str, Any]] = {
-    "as in the table": {},
+    "`tuned`": {},
     "no $w$": {"limits": {"braking_error_mm": None}},
     "$F$ = 0": {"limits": {"free_speed_mm_s": 0.0}},
     "$R$ = 100 mm": {"limits": {"free_reach_mm": 100.0}},
@@ -82,16 +84,22 @@ def table(rows: dict[str, tuple[ReferencePolicy, dict[str, Any]]]) -> str:
     return "\n".join(lines)
 
 
+def put(page: Path, lines: str, name: str) -> None:
+    """Replace the part of a page between the markers of a name."""
+    text = page.read_text(encoding="utf-8")
+    write_text(
+        page, with_part(text, lines, f"<!-- {name} -->", f"<!-- end of {name} -->", page.name)
+    )
+
+
 def main() -> None:
     """Write both tables."""
-    page = DOCS / "controller.md"
+    pages = DOCS / "controller"
     tuned = ReferencePolicy(TUNED)
     filters = table({name: (tuned, fields) for name, fields in FILTERS.items()})
     laws = table({name: (changed(change), {}) for name, change in LAWS.items()})
-    text = page.read_text(encoding="utf-8")
-    text = with_part(text, filters, "<!-- filter -->", "<!-- end of filter -->", page.name)
-    text = with_part(text, laws, "<!-- limits -->", "<!-- end of limits -->", page.name)
-    write_text(page, text)
+    put(pages / "slip-estimator.md", filters, "filter")
+    put(pages / "limits-and-spacing.md", laws, "limits")
 
 
 if __name__ == "__main__":
