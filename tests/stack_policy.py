@@ -33,7 +33,7 @@ from tlf_env.onboard.tracking import (
     tracking_twist,
 )
 from tlf_env.onboard.wheel_loop import (
-    WheelLoop,
+    WheelLoopRow,
     WheelLoopState,
     digital_wheel_loop,
     read_loop_state,
@@ -70,7 +70,7 @@ class StackSettings(NamedTuple):
 
     bodies: np.ndarray  # (field, robot, 1); one robot where all are alike
     ekf: Ekf
-    loop: WheelLoop
+    loop: WheelLoopRow
     gains: Gains
     observer_gain: float
     smoothing: float

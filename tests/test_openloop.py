@@ -127,7 +127,7 @@ def test_a_start_at_its_bounds_stays_finite(names, sign):
 def test_a_key_that_stands_twice_is_refused(tmp_path, text):
     path = tmp_path / "runs.json"
     path.write_text(text)
-    assert re.search("the key '(go|duration_s)' stands there twice", complaint(path))
+    assert re.search("the key '(go|duration_s)' is repeated", complaint(path))
 
 
 @pytest.mark.parametrize("missing", ["duration_s", "inputs"])

@@ -13,6 +13,10 @@ COUNTED = ("too_short", "too_long")
 WANTED = "Input should be "
 
 
+class RepeatedKeyError(ValueError):
+    """A mapping in a YAML or JSON file has the same key twice."""
+
+
 def one_line(error: ValidationError) -> str:
     """A validation error as one line: every place, what is wrong there, and the value."""
     told: dict[tuple[tuple[str, ...], str], Any] = {}

@@ -7,6 +7,8 @@ from typing import Any
 
 import yaml
 
+from tlf_env.common.errors import RepeatedKeyError
+
 PACKAGE = Path(__file__).resolve().parent.parent
 KINDS = {
     "scenario": "",
@@ -17,10 +19,6 @@ KINDS = {
     "search": "tune",
 }  # what a preset can be, and its folder inside the presets' folder
 SUFFIXES = (".yaml", ".yml")
-
-
-class _RepeatedKeyError(ValueError):
-    """A YAML mapping has a key twice."""
 
 
 class _Loader(yaml.SafeLoader):
@@ -34,9 +32,7 @@ class _Loader(yaml.SafeLoader):
             if isinstance(key, yaml.ScalarNode) and key.value != "<<":
                 if key.value in seen:
                     line = key.start_mark.line + 1
-                    raise _RepeatedKeyError(
-                        f"line {line}: the key {key.value!r} stands there twice"
-                    )
+                    raise RepeatedKeyError(f"line {line}: the key {key.value!r} is repeated")
                 seen.add(key.value)
         return node
 
@@ -53,7 +49,7 @@ def read_yaml(path: Path) -> dict[str, Any]:
         data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
-    except _RepeatedKeyError as error:
+    except RepeatedKeyError as error:
         raise ValueError(f"{path}, {error}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}") from error

@@ -39,7 +39,7 @@ from tlf_env.task.actions import (
     RESIDUAL,
     TORQUE,
     TWIST,
-    limited,
+    clipped_action,
     reference_action,
     residual_share,
     twist_action,
@@ -92,7 +92,7 @@ def take_actions(a: Arrays, lane: int, s: Settings) -> None:
             given = a.twists[lane, r]
             given[0], given[1] = reference_action(a.observations[lane, r], a.scales, s.base)
             a.actions[lane, r, 0], a.actions[lane, r, 1] = given[0], given[1]
-        a_0, a_1 = limited(a.actions[lane, r, 0]), limited(a.actions[lane, r, 1])
+        a_0, a_1 = clipped_action(a.actions[lane, r, 0]), clipped_action(a.actions[lane, r, 1])
         clipped = a_0 != a.actions[lane, r, 0] or a_1 != a.actions[lane, r, 1]
         if clipped:
             a.infos[lane, r, CLIPPED] += 1.0

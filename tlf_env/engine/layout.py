@@ -15,8 +15,8 @@ from tlf_env.onboard.estimator import Ekf, Estimate, ekf_constants
 from tlf_env.onboard.observer import Message, Reference
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate, slip_ekf_constants
 from tlf_env.onboard.wheel_loop import (
-    WheelLoop,
     WheelLoopParameters,
+    WheelLoopRow,
     WheelLoopState,
     digital_wheel_loop,
 )
@@ -259,7 +259,7 @@ def make_arrays(
         table=table.copy(),
         variants=np.arange(lanes) % len(scenarios),
         bodies=zeros(len(Body._fields)),
-        wheel_loops=zeros(len(WheelLoop._fields)),
+        wheel_loops=zeros(len(WheelLoopRow._fields)),
         ekfs=zeros(len(Ekf._fields)),
         slip_ekfs=zeros(len(SlipEkf._fields)),
         levels=np.zeros(lanes),

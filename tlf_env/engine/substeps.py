@@ -31,7 +31,7 @@ from tlf_env.onboard.slip_estimator import (
     predict_with_slip,
 )
 from tlf_env.onboard.tracking import body_errors
-from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState, wheel_torque
+from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState, wheel_torque
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Floor, Motion, axle_midpoint, conveyor, forward_and_yaw
 from tlf_env.task.actions import TORQUE
@@ -95,7 +95,7 @@ def wanted(order: Order, k: int) -> tuple[float, float]:
 
 @law
 def asked_torques(
-    body: Body, loop: WheelLoop, order: Order, held: WheelLoopState, sensors: Sensors, k: int
+    body: Body, loop: WheelLoopRow, order: Order, held: WheelLoopState, sensors: Sensors, k: int
 ) -> tuple[float, float, WheelLoopState]:
     """Torques asked for in substep ``k``, within the motors' limit, and what the wheel loops hold then."""
     limit = body.torque_limit

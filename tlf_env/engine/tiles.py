@@ -41,7 +41,7 @@ from tlf_env.engine.substeps import (
 from tlf_env.numerics.compiled import allocating, block, law, row_reader, row_writer, view
 from tlf_env.onboard.estimator import Ekf, Estimate
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
-from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState
+from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState
 from tlf_env.physics.kernel import roll, slide
 from tlf_env.physics.kinematics import follow_wheels
 from tlf_env.physics.parameters import Body
@@ -83,7 +83,7 @@ def _first_rows(rows: tuple[type[Any], ...]) -> list[int]:
 ) = _first_rows(
     (
         Body,
-        WheelLoop,
+        WheelLoopRow,
         Ekf,
         SlipEkf,
         Effects,
@@ -107,7 +107,7 @@ COLUMN = ROLLS + 1  # robot · lanes + lane: the item's column in the arrays
 ROWS = COLUMN + 1
 
 body_of = row_reader(Body, BODY)
-loop_of = row_reader(WheelLoop, LOOP)
+loop_of = row_reader(WheelLoopRow, LOOP)
 ekf_of = row_reader(Ekf, EKF_ROW)
 slip_ekf_of = row_reader(SlipEkf, SLIP_EKF)
 effects_of = row_reader(Effects, EFFECTS)

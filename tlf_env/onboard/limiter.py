@@ -33,7 +33,7 @@ class TwistLimits(Frozen):
     cancel_slip: bool = False  # take the estimated slip off the wheels' twist
 
 
-class Limits(NamedTuple):
+class TwistLimitsRow(NamedTuple):
     """The same as the compiled law takes them; infinity where there is none."""
 
     forward_error: float
@@ -50,7 +50,7 @@ class Limits(NamedTuple):
     slip: float  # 1 if the estimated slip counts, else 0
 
 
-def limits_row(limits: TwistLimits, period_s: float) -> Limits:
+def twist_limits_row(limits: TwistLimits, period_s: float) -> TwistLimitsRow:
     """Limits for a control period, as the compiled law takes them."""
 
     def finite(limit: float | None, factor: float = 1.0) -> float:
@@ -58,7 +58,7 @@ def limits_row(limits: TwistLimits, period_s: float) -> Limits:
 
     most, least = limits.acceleration_mm_s2, limits.turning_acceleration_mm_s2
     turning_loss = 0.0 if most is None or least is None else max(most - least, 0.0)
-    return Limits(
+    return TwistLimitsRow(
         finite(limits.forward_error_mm),
         finite(limits.lateral_error_mm),
         finite(limits.braking_error_mm),
@@ -102,7 +102,7 @@ def within(value: float, centre: float, reach: float) -> float:
 
 @law
 def speed_range(
-    b_1: float, b_2: float, cruise: float, error: float, limits: Limits
+    b_1: float, b_2: float, cruise: float, error: float, limits: TwistLimitsRow
 ) -> tuple[float, float]:
     """Speeds (mm/s) that the body may be asked for next, if ``b`` is what its last command comes to.
 
@@ -130,7 +130,7 @@ def limited_twist(
     delta_2: float,
     cruise: float,
     error: float,
-    limits: Limits,
+    limits: TwistLimitsRow,
 ) -> tuple[float, float]:
     """Twist for the wheels (mm/s, rad/s) if the body shall have ``u``.
 

@@ -123,14 +123,14 @@ read_slip_estimate = reader(SlipEstimate)
 write_slip_estimate = writer(SlipEstimate)
 
 
-def share(dt_s: float, time_s: float) -> float:
+def sample_weight(dt_s: float, time_s: float) -> float:
     """Weight of one sample in a mean over ``time_s``."""
     return -math.expm1(-dt_s / time_s)
 
 
 def slip_ekf_constants(p: SlipEkfParameters, dt_s: float) -> SlipEkf:
     """The filter's numbers for a sampling period of ``dt_s`` s, as the compiled law takes them."""
-    averaging = share(dt_s, p.surprise_time_s)
+    averaging = sample_weight(dt_s, p.surprise_time_s)
     return SlipEkf(
         p.forward_noise_mm2_s * dt_s,
         p.sideways_noise_mm2_s * dt_s,
@@ -140,7 +140,7 @@ def slip_ekf_constants(p: SlipEkfParameters, dt_s: float) -> SlipEkf:
         p.fix_variance_mm2,
         p.delta_1_bound_mm_s,
         p.delta_2_bound_rad_s,
-        0.0 if p.fix_variance_time_s is None else share(dt_s, p.fix_variance_time_s),
+        0.0 if p.fix_variance_time_s is None else sample_weight(dt_s, p.fix_variance_time_s),
         p.least_fix_variance_mm2,
         p.fix_variance_factor,
         averaging,
@@ -159,7 +159,7 @@ def slip_ekf_constants(p: SlipEkfParameters, dt_s: float) -> SlipEkf:
         p.grip_mm_s2 * dt_s**2,
         p.yaw_grip_rad_s2 * dt_s**2,
         (p.jump_uncertainty / dt_s) ** 2,
-        share(dt_s, ROUGHNESS_TIME_S),
+        sample_weight(dt_s, ROUGHNESS_TIME_S),
     )
 
 
@@ -173,7 +173,7 @@ def surprise(mean: float, variance: float, ekf: SlipEkf) -> float:
 
 
 @law
-def held(value: float, end: float) -> float:
+def clamped_from_zero(value: float, end: float) -> float:
     """``value`` held between 0 and ``end``."""
     return min(max(value, min(end, 0.0)), max(end, 0.0))
 
@@ -190,11 +190,11 @@ def jumps(
     """
     most += JUMP_NOISE * math.sqrt(rough)
     usual = min(max(change, -most), most)
-    away = held(change - usual, beyond)
+    away = clamped_from_zero(change - usual, beyond)
     spun = spin + (change - usual - away)
-    regained = held(away, -spun)
+    regained = clamped_from_zero(away, -spun)
     spun += regained
-    return usual, away - regained, spun - held(spun, math.copysign(grip, spun))
+    return usual, away - regained, spun - clamped_from_zero(spun, math.copysign(grip, spun))
 
 
 @law

@@ -12,7 +12,7 @@ from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.common.presets import read_preset_or_file
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.trig import sincos
-from tlf_env.onboard.limiter import Limits, TwistLimits, limits_row
+from tlf_env.onboard.limiter import TwistLimits, TwistLimitsRow, twist_limits_row
 from tlf_env.onboard.spacing import Spacing, SpacingRow, spacing_row
 
 
@@ -68,7 +68,7 @@ class ControllerRow(NamedTuple):
     """The same numbers as the compiled law takes them."""
 
     gains: Gains
-    limits: Limits
+    limits: TwistLimitsRow
     spacing: SpacingRow
     lead: float  # as a fraction of the time to the first preview
 
@@ -90,7 +90,7 @@ def controller_row(
     lead = known.lead_s / preview_s[0] if known.lead_s else 0.0
     return ControllerRow(
         gains_row(known.gains),
-        limits_row(known.limits, period_s),
+        twist_limits_row(known.limits, period_s),
         spacing_row(known.spacing),
         lead,
     )

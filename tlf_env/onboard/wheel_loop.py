@@ -24,7 +24,7 @@ class WheelLoopParameters(Frozen):
     pole_rad_s: Positive = 2.0
 
 
-class WheelLoop(NamedTuple):
+class WheelLoopRow(NamedTuple):
     """Digital form of eq. (13), torques in mN·mm: gain, integral step, lag decay and lag step."""
 
     gain: float
@@ -42,17 +42,17 @@ class WheelLoopState(NamedTuple):
     lag_r: float
 
 
-read_wheel_loop = reader(WheelLoop)
+read_wheel_loop = reader(WheelLoopRow)
 read_loop_state = reader(WheelLoopState)
 write_loop_state = writer(WheelLoopState)
 
 
-def digital_wheel_loop(p: WheelLoopParameters, dt_s: float) -> WheelLoop:
+def digital_wheel_loop(p: WheelLoopParameters, dt_s: float) -> WheelLoopRow:
     """Eq. (13) at a period of ``dt_s`` s: exact decay of the lag, and the current error already in."""
     integral = p.gain_Nmm_s * p.zeros_0 / p.pole_rad_s
     lag = -p.gain_Nmm_s * (p.pole_rad_s**2 - p.zeros_1 * p.pole_rad_s + p.zeros_0) / p.pole_rad_s
     decay = math.exp(-p.pole_rad_s * dt_s)
-    return WheelLoop(
+    return WheelLoopRow(
         p.gain_Nmm_s * MILLINEWTON_PER_NEWTON,
         integral * dt_s * MILLINEWTON_PER_NEWTON,
         decay,
@@ -62,7 +62,7 @@ def digital_wheel_loop(p: WheelLoopParameters, dt_s: float) -> WheelLoop:
 
 @law
 def wheel_torque(
-    error: float, integral: float, lag: float, loop: WheelLoop, limit: float
+    error: float, integral: float, lag: float, loop: WheelLoopRow, limit: float
 ) -> tuple[float, float, float]:
     """Torque for a speed error in rad/s; returns ``(torque, integral, lag)``, torque within ±``limit``.
 

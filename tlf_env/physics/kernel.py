@@ -10,14 +10,14 @@ from typing import NamedTuple
 
 from tlf_env.numerics.compiled import block, law
 from tlf_env.numerics.trig import sincos
-from tlf_env.physics.limits import Limits, limits
+from tlf_env.physics.friction_limits import FrictionLimits, friction_limits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.rolling import rolling
 from tlf_env.physics.state import Contact, Floor, Motion, Push, Rates
 from tlf_env.physics.sweeps import sweep
 
 
-class Setting(NamedTuple):
+class SubstepFrame(NamedTuple):
     """What the impulses of floor and friction are solved for."""
 
     sin_t: float  # heading at mid attitude
@@ -26,11 +26,11 @@ class Setting(NamedTuple):
     cos_p: float
     before: Rates  # velocities at the substep's start
     free: Rates  # the same, with torques and pushes
-    limits: Limits
+    limits: FrictionLimits
 
 
 @law
-def setting(
+def substep_frame(
     body: Body,
     motion: Motion,
     contact: Contact,
@@ -39,7 +39,7 @@ def setting(
     torque_l: float,
     torque_r: float,
     dt: float,
-) -> Setting:
+) -> SubstepFrame:
     """Frames at mid attitude, velocities without floor and friction, and the friction's limits."""
     sin_t, cos_t = sincos(motion.theta + 0.5 * dt * motion.w)
     sin_p, cos_p = sincos(motion.psi - motion.theta + 0.5 * dt * (motion.s - motion.w))
@@ -63,20 +63,20 @@ def setting(
         motion.omega_r + torque_r * dt * body.inverse_J,
         motion.omega_c,
     )
-    most = limits(body, motion, contact, floor, dt)
-    return Setting(sin_t, cos_t, sin_p, cos_p, before, free, most)
+    limits = friction_limits(body, motion, contact, floor, dt)
+    return SubstepFrame(sin_t, cos_t, sin_p, cos_p, before, free, limits)
 
 
 @law
-def moved(motion: Motion, at: Setting, after: Rates, dt: float) -> Motion:
+def moved(motion: Motion, frame: SubstepFrame, after: Rates, dt: float) -> Motion:
     """The motion with new velocities, in world axes; fork and wheel angles advanced with them."""
     return Motion(
         motion.x,
         motion.y,
         motion.theta,
         motion.psi + dt * after.s,
-        at.cos_t * after.v_e - at.sin_t * after.v_f,
-        at.sin_t * after.v_e + at.cos_t * after.v_f,
+        frame.cos_t * after.v_e - frame.sin_t * after.v_f,
+        frame.sin_t * after.v_e + frame.cos_t * after.v_f,
         after.w,
         after.s,
         after.omega_l,
@@ -99,9 +99,11 @@ def roll(
     dt: float,
 ) -> tuple[bool, Motion, Contact]:
     """A substep in closed form, and whether it holds: whether all three wheels roll."""
-    at = setting(body, motion, contact, floor, push, torque_l, torque_r, dt)
-    rolls, after, impulses = rolling(body, at.free, at.before, at.cos_p, at.sin_p, floor, at.limits)
-    return rolls, moved(motion, at, after, dt), impulses
+    frame = substep_frame(body, motion, contact, floor, push, torque_l, torque_r, dt)
+    rolls, after, impulses = rolling(
+        body, frame.free, frame.before, frame.cos_p, frame.sin_p, floor, frame.limits
+    )
+    return rolls, moved(motion, frame, after, dt), impulses
 
 
 @block
@@ -116,9 +118,11 @@ def slide(
     dt: float,
 ) -> tuple[Motion, Contact]:
     """A substep by sweeps, right whatever the wheels do."""
-    at = setting(body, motion, contact, floor, push, torque_l, torque_r, dt)
-    after, impulses = sweep(body, at.free, contact, at.cos_p, at.sin_p, floor, at.limits)
-    return moved(motion, at, after, dt), impulses
+    frame = substep_frame(body, motion, contact, floor, push, torque_l, torque_r, dt)
+    after, impulses = sweep(
+        body, frame.free, contact, frame.cos_p, frame.sin_p, floor, frame.limits
+    )
+    return moved(motion, frame, after, dt), impulses
 
 
 @block

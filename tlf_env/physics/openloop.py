@@ -5,15 +5,14 @@ from __future__ import annotations
 import itertools
 import json
 import math
-import re
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from tlf_env.common.errors import one_line
-from tlf_env.common.files import atomic
+from tlf_env.common.errors import RepeatedKeyError, one_line
+from tlf_env.common.files import FILE_NAME, atomic
 from tlf_env.common.models import Frozen
 from tlf_env.numerics.compiled import driver
 from tlf_env.physics.kernel import substep
@@ -46,11 +45,10 @@ COLUMNS = (
 ROW_EVERY_S = 0.1
 MAX_DURATION_S = 1e5
 MAX_TORQUE_NMM = 1e6
-MAX_STEPS = 100_000_000
+MAX_SUBSTEPS = 100_000_000
 # Far beyond any robot, and small enough that the plant's squares and products stay finite.
 MAX_MM = 1e9  # and mm/s
 MAX_RAD = 1e4  # and rad/s
-NAME = re.compile(r"[\w][\w.+-]{0,99}")
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Torque = Annotated[Number, Field(ge=-MAX_TORQUE_NMM, le=MAX_TORQUE_NMM)]
@@ -191,9 +189,9 @@ def run_open_loop(
         raise ValueError(
             f"dt_s {dt_s} must divide the {ROW_EVERY_S} s between rows, and be above 0"
         )
-    if scenario.duration_s / dt_s > MAX_STEPS:
+    if scenario.duration_s / dt_s > MAX_SUBSTEPS:
         raise ValueError(
-            f"dt_s {dt_s} makes more than {MAX_STEPS} steps of {scenario.duration_s} s"
+            f"dt_s {dt_s} makes more than {MAX_SUBSTEPS} steps of {scenario.duration_s} s"
         )
     per_row = round(ROW_EVERY_S / dt_s)
     if per_row < 1 or abs(per_row * dt_s - ROW_EVERY_S) > 1e-9:
@@ -215,16 +213,12 @@ def run_open_loop(
     return np.array(rows)
 
 
-class _RepeatedKeyError(ValueError):
-    """A JSON object has a key twice."""
-
-
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
     """A JSON object; the standard reader would keep the last of two equal keys in silence."""
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
-            raise _RepeatedKeyError(f"the key {key!r} stands there twice")
+            raise RepeatedKeyError(f"the key {key!r} is repeated")
         found[key] = value
     return found
 
@@ -242,7 +236,7 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
         data: Any = json.loads(text, object_pairs_hook=_without_repeats)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
-    except _RepeatedKeyError as error:
+    except RepeatedKeyError as error:
         raise ValueError(f"{path}: {error}") from error
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
@@ -251,7 +245,7 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
             f"{path} must hold an object of named scenarios, got {type(data).__name__}"
         )
     for name in data:
-        if not NAME.fullmatch(name):
+        if not FILE_NAME.fullmatch(name):
             raise ValueError(f"{path}: the scenario name {name!r} cannot be a file name")
     try:
         return TypeAdapter(dict[str, OpenLoopScenario]).validate_python(data)

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from tlf_env.numerics.compiled import law
-from tlf_env.physics.limits import Limits
+from tlf_env.physics.friction_limits import FrictionLimits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Floor, Rates
 
@@ -26,7 +26,7 @@ def rolling(
     cos_phi: float,
     sin_phi: float,
     floor: Floor,
-    limits: Limits,
+    limits: FrictionLimits,
 ) -> tuple[bool, Rates, Contact]:
     """Velocities and impulses if all wheels roll, and whether they do.
 

@@ -11,7 +11,7 @@ import math
 
 from tlf_env.numerics.compiled import block, law
 from tlf_env.physics.friction import disc
-from tlf_env.physics.limits import Limits
+from tlf_env.physics.friction_limits import FrictionLimits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Floor, Rates
 
@@ -166,7 +166,7 @@ def sweep(
     cos_p: float,
     sin_p: float,
     floor: Floor,
-    limits: Limits,
+    limits: FrictionLimits,
 ) -> tuple[Rates, Contact]:
     """Velocities and impulses of a substep; ``contact`` holds the last impulses, to start from."""
     # Warm start with all stored impulses.

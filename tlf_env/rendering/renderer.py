@@ -18,12 +18,12 @@ from tlf_env.rendering.looks import (
     CASTOR_WIDTH_MM,
     DRIVE_WHEEL_WIDTH_MM,
     NOSE,
+    RENDER_MODES,
     Colour,
     robot_colours,
 )
 from tlf_env.rendering.scene import Scene
 
-RENDER_MODES = ("rgb_array", "human")
 OVERSAMPLING = 2
 DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and grow with it
 SMALLEST_PX = 64

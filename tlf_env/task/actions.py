@@ -8,7 +8,7 @@ import numpy as np
 
 from tlf_env.numerics.compiled import law
 from tlf_env.onboard.limiter import braked, limited_twist, saturated
-from tlf_env.onboard.spacing import Heard, spaced_twist
+from tlf_env.onboard.spacing import Predecessor, spaced_twist
 from tlf_env.onboard.tracking import ControllerRow, tracking_twist
 from tlf_env.physics.parameters import Body
 from tlf_env.task.observation import Entry, Preview, Tracking
@@ -71,7 +71,7 @@ PREDECESSOR = Tracking._fields.index("predecessor_forward")
 
 
 @law
-def limited(a: float) -> float:
+def clipped_action(a: float) -> float:
     """An action's component within [−1, 1]."""
     return min(max(a, -1.0), 1.0)
 
@@ -100,10 +100,10 @@ def wanted_twist(
 
 
 @law
-def heard_predecessor(observation: np.ndarray, scales: np.ndarray) -> Heard:
+def received_predecessor(observation: np.ndarray, scales: np.ndarray) -> Predecessor:
     """The predecessor as one ``tracking`` observation tells of it."""
     i = PREDECESSOR
-    return Heard(
+    return Predecessor(
         observation[i] * scales[i],
         observation[i + 1] * scales[i + 1],
         observation[i + 2] * scales[i + 2],
@@ -120,7 +120,7 @@ def twist_action(
     """The ``twist`` action that asks the wheels for a twist (mm/s, rad/s), within the limits."""
     u_1 = max(u_1, -row.limits.reverse)
     if row.spacing.distance > 0.0 and observation[IS_LEADER] * scales[IS_LEADER] < 0.5:
-        u_1, u_2 = spaced_twist(u_1, u_2, heard_predecessor(observation, scales), row.spacing)
+        u_1, u_2 = spaced_twist(u_1, u_2, received_predecessor(observation, scales), row.spacing)
     v_1, v_2 = limited_twist(
         u_1,
         u_2,
@@ -132,7 +132,7 @@ def twist_action(
         math.hypot(observation[E_1] * scales[E_1], observation[E_2] * scales[E_2]),
         row.limits,
     )
-    return limited(v_1 / FULL_SPEED_MM_S), limited(v_2 / FULL_YAW_RATE_RAD_S)
+    return clipped_action(v_1 / FULL_SPEED_MM_S), clipped_action(v_2 / FULL_YAW_RATE_RAD_S)
 
 
 @law

@@ -26,9 +26,9 @@ RATE_S = 0.1  # a robot may take so long over a change of speed or of yaw rate
 TURNS_RAD_S = 0.01  # slower, the castor need not swing
 SPOT_MM = 1.0  # a turn within a sample that travels less than this is on the spot
 # What the observation `sensor` can tell before it is clipped.
-FARTHEST_FIX_MM = OBSERVATION_LIMIT * SAMPLE_ENTRIES["fix_x"].scale
-FARTHEST_START_MM = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["start_x"].scale
-LONGEST_S = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["time"].scale
+SENSOR_FIX_LIMIT_MM = OBSERVATION_LIMIT * SAMPLE_ENTRIES["fix_x"].scale
+SENSOR_START_LIMIT_MM = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["start_x"].scale
+SENSOR_TIME_LIMIT_S = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["time"].scale
 
 
 def motor_acceleration(robot: RobotParameters) -> float:
@@ -174,12 +174,12 @@ def sensor_warnings(
 
 
 def _far_starts(starts: np.ndarray) -> Iterator[str]:
-    far = np.abs(starts).max(axis=1) > FARTHEST_START_MM
+    far = np.abs(starts).max(axis=1) > SENSOR_START_LIMIT_MM
     if far.any():
         i = _first(far)
         yield (
             f"t = 0 s: robot_{i} starts at ({starts[i, 0]:.0f}, {starts[i, 1]:.0f}) mm; observation "
-            f"'sensor' clips start_x and start_y at ±{FARTHEST_START_MM:.0f} mm{_and_more(far)}"
+            f"'sensor' clips start_x and start_y at ±{SENSOR_START_LIMIT_MM:.0f} mm{_and_more(far)}"
         )
 
 
@@ -192,15 +192,15 @@ def _far_places(
     last = len(t_s) - 1 - gap_steps * np.arange(len(starts))
     driven = last >= 0
     k = np.maximum(last, 0)
-    far = driven & (np.maximum(high[k] - starts, starts - low[k]).max(axis=1) > FARTHEST_FIX_MM)
+    far = driven & (np.maximum(high[k] - starts, starts - low[k]).max(axis=1) > SENSOR_FIX_LIMIT_MM)
     if far.any():
         i = _first(far)
         apart = places - starts[i]
-        at = _first(np.abs(apart).max(axis=1) > FARTHEST_FIX_MM)
+        at = _first(np.abs(apart).max(axis=1) > SENSOR_FIX_LIMIT_MM)
         yield (
             f"{_place(t_s, reference, at)}: the reference is ({apart[at, 0]:.0f}, "
             f"{apart[at, 1]:.0f}) mm from the start of robot_{i}; observation 'sensor' clips fixes "
-            f"and messages at ±{FARTHEST_FIX_MM:.0f} mm from it{_and_more(far)}"
+            f"and messages at ±{SENSOR_FIX_LIMIT_MM:.0f} mm from it{_and_more(far)}"
         )
 
 
@@ -210,9 +210,9 @@ def _and_more(far: np.ndarray) -> str:
 
 
 def _long_horizon(horizon_s: float) -> Iterator[str]:
-    if horizon_s > LONGEST_S:
+    if horizon_s > SENSOR_TIME_LIMIT_S:
         yield (
-            f"t = {LONGEST_S:.0f} s: observation 'sensor' clips time there; the horizon is "
+            f"t = {SENSOR_TIME_LIMIT_S:.0f} s: observation 'sensor' clips time there; the horizon is "
             f"{horizon_s:g} s"
         )
 

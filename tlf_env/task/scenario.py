@@ -20,6 +20,7 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from tlf_env.common.errors import one_line
+from tlf_env.common.files import FILE_NAME
 from tlf_env.common.models import Frozen, NonNegative, Positive, no_switch
 from tlf_env.common.presets import is_file_name, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
@@ -44,10 +45,9 @@ SETTLE_FRACTION = 0.4
 START_MARGIN_MM = 1.0  # between outlines at the start
 DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
-NAME = re.compile(r"\w[\w.+-]{0,99}")  # a folder of results is named by it
 NOT_IN_NAMES = re.compile(r"^[^\w]+|[^\w.+-]")
 
-EndReason = Literal["lost", "touched"]
+EndCondition = Literal["lost", "touched"]
 
 
 def _part_path(value: str) -> str:
@@ -125,7 +125,7 @@ class Scenario(Frozen):
         default_factory=lambda: FrozenDict(DEFAULT_WEIGHTS._asdict())
     )
     cooperative: bool = False  # every robot gets the formation's mean reward
-    end_on: tuple[EndReason, ...] = ("lost", "touched")
+    end_on: tuple[EndCondition, ...] = ("lost", "touched")
     lost_beyond_mm: Positive = 1200.0
 
     @model_validator(mode="before")
@@ -148,7 +148,7 @@ class Scenario(Frozen):
     @field_validator("name", mode="after")
     @classmethod
     def _names_a_folder(cls, value: str) -> str:
-        if not NAME.fullmatch(value):
+        if not FILE_NAME.fullmatch(value):
             raise ValueError(
                 f"must be 1 to 100 letters, digits and _ . + -, a letter, digit or _ first, "
                 f"got {value!r}"

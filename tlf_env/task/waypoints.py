@@ -133,7 +133,7 @@ class Drive(NamedTuple):
         out[1:, inside != t_s] = 0.0
         return np.moveaxis(out, -1, 1)
 
-    def told_at(self, t_s: np.ndarray) -> np.ndarray:
+    def heading_time(self, t_s: np.ndarray) -> np.ndarray:
         """When the heading at ``t_s`` was last told: ``t_s`` itself while it moves."""
         stretch = np.maximum(np.searchsorted(self.from_s, t_s, side="left") - 1, 0)
         return np.clip(t_s, self.first_s[stretch], self.last_s[stretch])

@@ -11,7 +11,7 @@ from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Floor, Motion
 
 
-class Limits(NamedTuple):
+class FrictionLimits(NamedTuple):
     """Friction circles of the tyres (mN·s) and largest friction impulses of the joints (mN·mm·s)."""
 
     grip_l: float
@@ -85,9 +85,11 @@ def steering_axle(body: Body, phi_rate: float, p_x: float, p_y: float, dt: float
 
 
 @law
-def limits(body: Body, motion: Motion, contact: Contact, floor: Floor, dt: float) -> Limits:
+def friction_limits(
+    body: Body, motion: Motion, contact: Contact, floor: Floor, dt: float
+) -> FrictionLimits:
     """All limits of a substep, from the speeds at its start and the last impulses."""
-    return Limits(
+    return FrictionLimits(
         grip(body, body.load_drive, floor.grip_l, contact.slip_l, dt),
         grip(body, body.load_drive, floor.grip_r, contact.slip_r, dt),
         grip(body, body.load_castor, floor.grip_c, contact.slip_c, dt),
