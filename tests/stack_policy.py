@@ -19,7 +19,6 @@ from tlf_env.onboard.estimator import (
     Estimate,
     correct,
     ekf_constants,
-    odometry,
     predict,
     read_estimate,
     write_estimate,
@@ -40,14 +39,13 @@ from tlf_env.onboard.wheel_loop import (
     wheel_torque,
     write_loop_state,
 )
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, body_array
-from tlf_env.physics.state import read_body
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.vehicle import body_array, odometry, read_body, wheel_speeds
 from tlf_env.task.actions import (
     ACTION_SIZE,
     FULL_SPEED_MM_S,
     FULL_TORQUE_NMM,
     FULL_YAW_RATE_RAD_S,
-    wheel_speeds,
 )
 from tlf_env.task.observation import SAMPLE_ENTRIES, SensorTail, sensor_entries
 from tlf_env.task.scenario import Scenario

@@ -15,7 +15,6 @@ from baselines import ReferencePolicy
 from tlf_env.engine.formation import Formation
 from tlf_env.envs.single import FormationEnv
 from tlf_env.onboard.controllers import controller, controller_names
-from tlf_env.onboard.estimator import odometry
 from tlf_env.onboard.limiter import (
     TwistLimits,
     braked,
@@ -32,6 +31,7 @@ from tlf_env.onboard.tracking import (
     gains_row,
     tracking_twist,
 )
+from tlf_env.physics.kinematics import odometry
 from tlf_env.physics.parameters import body
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import TRACKING_ENTRIES, Preview, Tracking, tracking_entries

@@ -58,13 +58,6 @@ def ekf_constants(p: EkfParameters) -> Ekf:
 
 
 @law
-def odometry(angle_l: float, angle_r: float, R: float, h: float) -> tuple[float, float]:
-    """Eq. (29): travelled distance (mm) and turn (rad) from the wheels' angle increments (rad)."""
-    s_l, s_r = R * angle_l, R * angle_r
-    return 0.5 * (s_r + s_l), (s_r - s_l) / (2.0 * h)
-
-
-@law
 def predict(e: Estimate, ekf: Ekf, u_1: float, u_2: float) -> Estimate:
     """Eqs (28), (36), (38): pose and covariance one sample on, for increments u₁ (mm), u₂ (rad)."""
     sin, cos = sincos(e.theta + 0.5 * u_2)

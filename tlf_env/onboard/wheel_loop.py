@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from tlf_env.common.models import Frozen, Positive
 from tlf_env.numerics.compiled import law, reader, writer
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
 
 class WheelLoopParameters(Frozen):

@@ -1,4 +1,4 @@
-"""The ``kinematic`` plant: wheels follow their command exactly and the robot moves by eq. (14)."""
+"""Kinematics of two driven wheels: odometry, its inverse, and the ``kinematic`` plant."""
 
 from __future__ import annotations
 
@@ -6,6 +6,19 @@ from tlf_env.numerics.compiled import law
 from tlf_env.numerics.trig import sincos
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Motion
+
+
+@law
+def odometry(angle_l: float, angle_r: float, R: float, h: float) -> tuple[float, float]:
+    """Eq. (29): travelled distance (mm) and turn (rad) from the wheels' angle increments (rad)."""
+    s_l, s_r = R * angle_l, R * angle_r
+    return 0.5 * (s_r + s_l), (s_r - s_l) / (2.0 * h)
+
+
+@law
+def wheel_speeds(forward: float, turn: float, body: Body) -> tuple[float, float]:
+    """Wheel speeds (left, right; rad/s) of a twist (mm/s, rad/s): the inverse of eq. (1)."""
+    return (forward - turn * body.h) / body.R, (forward + turn * body.h) / body.R
 
 
 @law
@@ -18,7 +31,10 @@ def follow_wheels(
     delta_2: float,
     dt: float,
 ) -> Motion:
-    """Eqs (1) and (14) over one substep, by the midpoint rule about c; the castor trails along."""
+    """The ``kinematic`` plant: wheels follow their command exactly, eqs (1) and (14) over one substep.
+
+    By the midpoint rule about c; the castor trails along.
+    """
     u_1 = 0.5 * body.R * (omega_l + omega_r) + delta_1
     u_2 = 0.5 * body.R / body.h * (omega_r - omega_l) + delta_2
     sin, cos = sincos(motion.theta)

@@ -8,14 +8,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tlf_env.physics.kernel import substep
-from tlf_env.physics.parameters import (
-    MILLINEWTON_PER_NEWTON,
-    Body,
-    FrictionCurve,
-    RobotParameters,
-    body,
-)
+from tlf_env.physics.parameters import Body, FrictionCurve, RobotParameters, body
 from tlf_env.physics.state import Contact, Floor, Motion, Push
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
 STATES = ("forward_mm_s", "yaw_rad_s", "castor_rad")
 INPUTS = ("torque_l_Nmm", "torque_r_Nmm")

@@ -16,7 +16,7 @@ from tlf_env.common.files import FILE_NAME, atomic
 from tlf_env.common.models import Frozen
 from tlf_env.numerics.compiled import driver
 from tlf_env.physics.kernel import substep
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, RobotParameters, body_array
+from tlf_env.physics.parameters import RobotParameters, body_array
 from tlf_env.physics.state import (
     Contact,
     Floor,
@@ -29,6 +29,7 @@ from tlf_env.physics.state import (
     write_contact,
     write_motion,
 )
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
 COLUMNS = (
     "t_s",

@@ -12,8 +12,8 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.numerics.compiled import law
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
-MILLINEWTON_PER_NEWTON = 1000.0
 LOAD_SPLIT_TOLERANCE = 1e-9
 
 

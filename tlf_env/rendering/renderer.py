@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.rendering.drawing import BLOCK, FLOOR, INK, Place, Shapes, View, mixed
 from tlf_env.rendering.looks import (
     CASTOR_WIDTH_MM,

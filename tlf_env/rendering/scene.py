@@ -8,7 +8,7 @@ import numpy as np
 
 from tlf_env.engine.formation import Formation
 from tlf_env.onboard.observer import Reference
-from tlf_env.physics.state import Contact, Motion
+from tlf_env.physics.vehicle import Contact, Motion
 from tlf_env.task.info import Info, State
 
 STILL_MM = 1e-3  # who went less has no direction

@@ -10,7 +10,7 @@ from tlf_env.numerics.compiled import law
 from tlf_env.onboard.limiter import braked, limited_twist, saturated
 from tlf_env.onboard.spacing import Predecessor, spaced_twist
 from tlf_env.onboard.tracking import ControllerRow, tracking_twist
-from tlf_env.physics.parameters import Body
+from tlf_env.physics.vehicle import Body, wheel_speeds
 from tlf_env.task.observation import Entry, Preview, Tracking
 
 ACTION_SIZE = 2
@@ -160,12 +160,6 @@ def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float, rea
     near = 1.0 if fade == 0.0 else error / (error + fade)
     far = squared / (reach * reach)
     return near / (1.0 + far * far)
-
-
-@law
-def wheel_speeds(forward: float, turn: float, body: Body) -> tuple[float, float]:
-    """Wheel speeds (left, right; rad/s) of a twist (mm/s, rad/s): the inverse of eq. (1)."""
-    return (forward - turn * body.h) / body.R, (forward + turn * body.h) / body.R
 
 
 @law

@@ -1,6 +1,6 @@
 """What a reference trajectory asks of the robots beyond what they can do, in words.
 
-The limits follow from :class:`~tlf_env.physics.parameters.RobotParameters`; ``docs/trajectories.md``
+The limits follow from :class:`~tlf_env.physics.vehicle.RobotParameters`; ``docs/trajectories.md``
 derives them. They are for warnings: a scenario that breaks them still runs.
 """
 
@@ -11,7 +11,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, RobotParameters, body
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.vehicle import RobotParameters, body
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import OBSERVATION_LIMIT, SAMPLE_ENTRIES, SENSOR_TAIL_ENTRIES
 from tlf_env.task.trajectories import Trajectory, sample

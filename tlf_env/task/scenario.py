@@ -31,7 +31,7 @@ from tlf_env.onboard.parts import PART_PATTERN
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.task.feasibility import disturbed, sensor_warnings, start_note, warnings_for
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
 from tlf_env.task.trajectories import Trajectory
