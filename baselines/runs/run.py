@@ -18,7 +18,7 @@ from tlf_env.engine.formation import Formation
 from tlf_env.engine.layout import Arrays
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import Factory, Policy, predicted
-from tlf_env.physics.state import Motion
+from tlf_env.physics.vehicle import Motion
 from tlf_env.task.info import Info
 from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, string_metrics
 from tlf_env.task.scenario import Scenario

@@ -23,9 +23,8 @@ from tlf_env.engine.outside_parts import Parts, part_factories
 from tlf_env.engine.settings import settings
 from tlf_env.engine.starting import OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.onboard.parts import Factory
-from tlf_env.physics.parameters import Body
 from tlf_env.physics.pymunk_plant import PymunkPlant
-from tlf_env.physics.state import Motion
+from tlf_env.physics.vehicle import Body, Motion
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.trajectories import sample
 

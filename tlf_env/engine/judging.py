@@ -11,11 +11,11 @@ from tlf_env.engine.radio import DELTA_1, DELTA_2, delayed_message, latest_messa
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
-from tlf_env.onboard.estimator import odometry, read_estimate
+from tlf_env.onboard.estimator import read_estimate
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.tracking import body_errors
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, Body
-from tlf_env.physics.state import axle_midpoint, read_body, read_motion
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.vehicle import Body, axle_midpoint, odometry, read_body, read_motion
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.info import HORIZON, LOST, OTHER_ROBOT, RUNNING, TOUCHED, Info
 from tlf_env.task.measures import distance, time_gap_error

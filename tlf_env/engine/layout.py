@@ -20,8 +20,7 @@ from tlf_env.onboard.wheel_loop import (
     WheelLoopState,
     digital_wheel_loop,
 )
-from tlf_env.physics.parameters import Body, body_array
-from tlf_env.physics.state import Contact, Motion
+from tlf_env.physics.vehicle import Body, Contact, Motion, body_array
 from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
 from tlf_env.task.info import Info
 from tlf_env.task.measures import TIME_GAP_WINDOW_S

@@ -6,8 +6,7 @@ import math
 
 from tlf_env.engine.layout import Arrays
 from tlf_env.numerics.compiled import law
-from tlf_env.physics.parameters import Body
-from tlf_env.physics.state import read_motion
+from tlf_env.physics.vehicle import Body, read_motion
 from tlf_env.task.measures import ROUNDING_MM, distance
 
 # Outlines that could come closer than this within a control step are stepped through the space.

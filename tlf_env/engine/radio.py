@@ -18,7 +18,7 @@ from tlf_env.onboard.observer import (
     smoothing,
 )
 from tlf_env.onboard.slip_estimator import SlipEstimate
-from tlf_env.physics.state import forward_and_yaw, read_motion
+from tlf_env.physics.vehicle import forward_and_yaw, read_motion
 
 DELTA_1 = SlipEstimate._fields.index("delta_1")
 DELTA_2 = SlipEstimate._fields.index("delta_2")

@@ -23,8 +23,7 @@ from tlf_env.engine.settings import Settings
 from tlf_env.engine.substeps import evaluate
 from tlf_env.numerics.compiled import block, law, writer
 from tlf_env.numerics.philox import normal_pair, unit, words
-from tlf_env.physics.parameters import Mass, laden
-from tlf_env.physics.state import read_body
+from tlf_env.physics.vehicle import Mass, laden, read_body
 from tlf_env.task.measures import distance
 from tlf_env.task.scenario import START_MARGIN_MM
 

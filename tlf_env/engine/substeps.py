@@ -23,7 +23,7 @@ from tlf_env.engine.layout import Arrays, Sample, Sensors, Trace
 from tlf_env.engine.settings import EKF, EKF_SLIP, TRUTH, Settings
 from tlf_env.numerics.compiled import block, law
 from tlf_env.numerics.philox import normal_pair
-from tlf_env.onboard.estimator import Ekf, Estimate, correct, odometry, predict
+from tlf_env.onboard.estimator import Ekf, Estimate, correct, predict
 from tlf_env.onboard.slip_estimator import (
     SlipEkf,
     SlipEstimate,
@@ -32,8 +32,16 @@ from tlf_env.onboard.slip_estimator import (
 )
 from tlf_env.onboard.tracking import body_errors
 from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState, wheel_torque
-from tlf_env.physics.parameters import Body
-from tlf_env.physics.state import Contact, Floor, Motion, axle_midpoint, conveyor, forward_and_yaw
+from tlf_env.physics.vehicle import (
+    Body,
+    Contact,
+    Floor,
+    Motion,
+    axle_midpoint,
+    conveyor,
+    forward_and_yaw,
+    odometry,
+)
 from tlf_env.task.actions import TORQUE
 
 CERTAIN = (0.0,) * (len(SlipEstimate._fields) - 2)  # what the true slip leaves to be estimated

@@ -42,10 +42,16 @@ from tlf_env.numerics.compiled import allocating, block, law, row_reader, row_wr
 from tlf_env.onboard.estimator import Ekf, Estimate
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
 from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState
-from tlf_env.physics.kernel import roll, slide
-from tlf_env.physics.kinematics import follow_wheels
-from tlf_env.physics.parameters import Body
-from tlf_env.physics.state import Contact, Motion, Push, advance_pose
+from tlf_env.physics.vehicle import (
+    Body,
+    Contact,
+    Motion,
+    Push,
+    advance_pose,
+    follow_wheels,
+    roll,
+    slide,
+)
 from tlf_env.task.actions import TORQUE
 
 WIDTH = 8  # items in a tile: doubles in the widest vectors there are
