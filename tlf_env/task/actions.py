@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 
@@ -16,7 +17,8 @@ from tlf_env.task.observation import Entry, Preview, Tracking
 ACTION_SIZE = 2
 TWIST, WHEEL_SPEED, TORQUE, RESIDUAL = range(4)
 REFERENCE = 5  # no action of its own: the reference's twist takes its place
-ACTION_KINDS = {
+ActionKind = Literal["twist", "wheel_speed", "torque", "residual"]
+ACTION_KINDS: dict[ActionKind, int] = {
     "twist": TWIST,
     "wheel_speed": WHEEL_SPEED,
     "torque": TORQUE,
