@@ -6,9 +6,10 @@ import math
 
 from tlf_env.disturbances.channels import DROPOUT, JITTER, RADIO_DROPOUT, RADIO_JITTER
 from tlf_env.engine.layout import Arrays, read_trace
-from tlf_env.engine.settings import TRUTH, Settings
+from tlf_env.engine.settings import Settings
 from tlf_env.numerics.compiled import law, slot_reader, slot_writer
 from tlf_env.numerics.philox import unit, words
+from tlf_env.onboard.kinds import TRUTH
 from tlf_env.onboard.observer import (
     Message,
     Reference,

@@ -20,10 +20,11 @@ from tlf_env.disturbances.channels import (
 from tlf_env.disturbances.model import Effects
 from tlf_env.disturbances.signals import SignalRow, is_due, signal_value
 from tlf_env.engine.layout import Arrays, Sample, Sensors, Trace
-from tlf_env.engine.settings import EKF, EKF_SLIP, TRUTH, Settings
+from tlf_env.engine.settings import Settings
 from tlf_env.numerics.compiled import block, law
 from tlf_env.numerics.philox import normal_pair
 from tlf_env.onboard.estimator import Ekf, Estimate, correct, predict
+from tlf_env.onboard.kinds import EKF, EKF_SLIP, TRUTH
 from tlf_env.onboard.slip_estimator import (
     SlipEkf,
     SlipEstimate,
