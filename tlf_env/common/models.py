@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Any
 
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
@@ -18,6 +19,11 @@ def no_switch(value: Any) -> Any:
     if isinstance(value, bool):
         raise ValueError(f"must be a number, got {value!r}")
     return value
+
+
+def infinite_if_none(limit: float | None, factor: float = 1.0) -> float:
+    """A limit times a factor; infinity for None, where there is no limit."""
+    return math.inf if limit is None else limit * factor
 
 
 Positive = Annotated[FiniteFloat, BeforeValidator(no_switch), Field(gt=0)]

@@ -90,11 +90,11 @@ def friction_limits(
 ) -> FrictionLimits:
     """All limits of a substep, from the speeds at its start and the last impulses."""
     return FrictionLimits(
-        grip(body, body.load_drive, floor.grip_l, contact.slip_l, dt),
-        grip(body, body.load_drive, floor.grip_r, contact.slip_r, dt),
-        grip(body, body.load_castor, floor.grip_c, contact.slip_c, dt),
-        drive_axle(body, motion.omega_l, contact.p_le, contact.p_lf, dt),
-        drive_axle(body, motion.omega_r, contact.p_re, contact.p_rf, dt),
-        castor_axle(body, motion.omega_c, contact.p_cx, contact.p_cy, dt),
-        steering_axle(body, motion.s - motion.w, contact.p_cx, contact.p_cy, dt),
+        grip_l=grip(body, body.load_drive, floor.grip_l, contact.slip_l, dt),
+        grip_r=grip(body, body.load_drive, floor.grip_r, contact.slip_r, dt),
+        grip_c=grip(body, body.load_castor, floor.grip_c, contact.slip_c, dt),
+        axle_l=drive_axle(body, motion.omega_l, contact.p_le, contact.p_lf, dt),
+        axle_r=drive_axle(body, motion.omega_r, contact.p_re, contact.p_rf, dt),
+        axle_c=castor_axle(body, motion.omega_c, contact.p_cx, contact.p_cy, dt),
+        steering=steering_axle(body, motion.s - motion.w, contact.p_cx, contact.p_cy, dt),
     )

@@ -9,12 +9,15 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import block, law
+from tlf_env.numerics.rows import replacing
 from tlf_env.numerics.trig import sincos
 from tlf_env.physics.friction_limits import FrictionLimits, friction_limits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.rolling import rolling
 from tlf_env.physics.state import Contact, Floor, Motion, Push, Rates
 from tlf_env.physics.sweeps import sweep
+
+with_torques = replacing(Rates, "w", "omega_l", "omega_r")
 
 
 class SubstepFrame(NamedTuple):
@@ -46,44 +49,48 @@ def substep_frame(
     v_x = motion.v_x + push.f_x * dt * body.inverse_m
     v_y = motion.v_y + push.f_y * dt * body.inverse_m
     before = Rates(
-        cos_t * v_x + sin_t * v_y,
-        -sin_t * v_x + cos_t * v_y,
-        motion.w,
-        motion.s,
-        motion.omega_l,
-        motion.omega_r,
-        motion.omega_c,
+        v_e=cos_t * v_x + sin_t * v_y,
+        v_f=-sin_t * v_x + cos_t * v_y,
+        w=motion.w,
+        s=motion.s,
+        omega_l=motion.omega_l,
+        omega_r=motion.omega_r,
+        omega_c=motion.omega_c,
     )
-    free = Rates(
-        before.v_e,
-        before.v_f,
-        motion.w + push.torque * dt * body.inverse_I,
-        motion.s,
-        motion.omega_l + torque_l * dt * body.inverse_J,
-        motion.omega_r + torque_r * dt * body.inverse_J,
-        motion.omega_c,
+    free = with_torques(
+        before,
+        w=motion.w + push.torque * dt * body.inverse_I,
+        omega_l=motion.omega_l + torque_l * dt * body.inverse_J,
+        omega_r=motion.omega_r + torque_r * dt * body.inverse_J,
     )
-    limits = friction_limits(body, motion, contact, floor, dt)
-    return SubstepFrame(sin_t, cos_t, sin_p, cos_p, before, free, limits)
+    return SubstepFrame(
+        sin_t=sin_t,
+        cos_t=cos_t,
+        sin_p=sin_p,
+        cos_p=cos_p,
+        before=before,
+        free=free,
+        limits=friction_limits(body, motion, contact, floor, dt),
+    )
 
 
 @law
 def moved(motion: Motion, frame: SubstepFrame, after: Rates, dt: float) -> Motion:
     """The motion with new velocities, in world axes; fork and wheel angles advanced with them."""
     return Motion(
-        motion.x,
-        motion.y,
-        motion.theta,
-        motion.psi + dt * after.s,
-        frame.cos_t * after.v_e - frame.sin_t * after.v_f,
-        frame.sin_t * after.v_e + frame.cos_t * after.v_f,
-        after.w,
-        after.s,
-        after.omega_l,
-        after.omega_r,
-        after.omega_c,
-        motion.angle_l + dt * after.omega_l,
-        motion.angle_r + dt * after.omega_r,
+        x=motion.x,
+        y=motion.y,
+        theta=motion.theta,
+        psi=motion.psi + dt * after.s,
+        v_x=frame.cos_t * after.v_e - frame.sin_t * after.v_f,
+        v_y=frame.sin_t * after.v_e + frame.cos_t * after.v_f,
+        w=after.w,
+        s=after.s,
+        omega_l=after.omega_l,
+        omega_r=after.omega_r,
+        omega_c=after.omega_c,
+        angle_l=motion.angle_l + dt * after.omega_l,
+        angle_r=motion.angle_r + dt * after.omega_r,
     )
 
 

@@ -133,7 +133,7 @@ class RobotParameters(Frozen):
 class Joint(NamedTuple):
     """Eq. (5) in kernel units, with its constant parts gathered: T_f = μ(v)·(constant + radial + bending).
 
-    ``axial_mm`` multiplies the axial force, ``radial_mm`` the radial one, ``bending`` the bending
+    ``axial`` (mm) multiplies the axial force, ``radial`` (mm) the radial one, ``bending`` the bending
     moment; ``preload`` is in mN·mm.
     """
 
@@ -141,8 +141,8 @@ class Joint(NamedTuple):
     mu_dynamic: float
     stiction_speed: float
     dynamic_speed: float
-    axial_mm: float
-    radial_mm: float
+    axial: float
+    radial: float
     bending: float
     preload: float
 
@@ -242,15 +242,20 @@ class Body(NamedTuple):
 def _joint_row(joint: JointFriction, *, enabled: bool) -> Joint:
     on = 1.0 if enabled else 0.0
     return Joint(
-        on * joint.mu_static,
-        on * joint.mu_dynamic,
-        joint.stiction_speed_mm_s,
-        joint.dynamic_speed_mm_s,
-        joint.friction_arm_mm,
-        joint.pin_radius_mm,
-        joint.pin_radius_mm / joint.bending_arm_mm if joint.bending else 0.0,
-        joint.preload_Nmm * MILLINEWTON_PER_NEWTON,
+        mu_static=on * joint.mu_static,
+        mu_dynamic=on * joint.mu_dynamic,
+        stiction_speed=joint.stiction_speed_mm_s,
+        dynamic_speed=joint.dynamic_speed_mm_s,
+        axial=joint.friction_arm_mm,
+        radial=joint.pin_radius_mm,
+        bending=joint.pin_radius_mm / joint.bending_arm_mm if joint.bending else 0.0,
+        preload=joint.preload_Nmm * MILLINEWTON_PER_NEWTON,
     )
+
+
+def _prefixed(prefix: str, joint: Joint) -> dict[str, float]:
+    """A joint's numbers by the names of their fields in :class:`Body`."""
+    return {f"{prefix}_{name}": value for name, value in joint._asdict().items()}
 
 
 def weighed(
@@ -269,19 +274,19 @@ def weighed(
     weight = m * gravity
     inverse_m, inverse_I = 1.0 / m, 1.0 / I
     return Mass(
-        m,
-        I,
-        d,
-        pivot - d,
-        drive_share * weight,
-        castor_share * weight,
-        inverse_m + d * d * inverse_I,
-        inverse_m + h * h * inverse_I,
-        d * h * inverse_I,
-        I + m * (d * d) + 2.0 * spin_mass * (h * h),
-        inverse_m,
-        inverse_I,
-        d - outline_behind,
+        m=m,
+        I=I,
+        d=d,
+        q=pivot - d,
+        load_drive=drive_share * weight,
+        load_castor=castor_share * weight,
+        w_ee=inverse_m + d * d * inverse_I,
+        w_ff=inverse_m + h * h * inverse_I,
+        w_ef=d * h * inverse_I,
+        I_rolling=I + m * (d * d) + 2.0 * spin_mass * (h * h),
+        inverse_m=inverse_m,
+        inverse_I=inverse_I,
+        outline_ahead=d - outline_behind,
     )
 
 
@@ -300,68 +305,69 @@ def laden(empty: Body, mass: float, behind: float, inertia: float) -> Mass:
     own, other = d - empty.d, behind - d
     castor_share = d / (empty.pivot + empty.T)
     return compiled_weighed(
-        m,
-        empty.I + empty.m * (own * own) + inertia + mass * (other * other),
-        d,
-        (1.0 - castor_share) / 2.0,
-        castor_share,
-        empty.gravity,
-        empty.pivot,
-        empty.h,
-        empty.spin_mass_drive,
-        empty.outline_behind,
+        m=m,
+        I=empty.I + empty.m * (own * own) + inertia + mass * (other * other),
+        d=d,
+        drive_share=(1.0 - castor_share) / 2.0,
+        castor_share=castor_share,
+        gravity=empty.gravity,
+        pivot=empty.pivot,
+        h=empty.h,
+        spin_mass=empty.spin_mass_drive,
+        outline_behind=empty.outline_behind,
     )
 
 
-def body(p: RobotParameters) -> Body:
+def body(robot: RobotParameters) -> Body:
     """Kernel constants of one robot."""
-    half_mm = p.axle_width_mm / 2
-    spin_mass = p.wheel_inertia_kg_mm2 / p.wheel_radius_mm**2
+    half_mm = robot.axle_width_mm / 2
+    spin_mass = robot.wheel_inertia_kg_mm2 / robot.wheel_radius_mm**2
     mass = weighed(
-        p.mass_kg,
-        p.body_inertia_kg_mm2,
-        p.com_offset_mm,
-        p.drive_load_share,
-        p.castor_load_share,
-        p.gravity_mm_s2,
-        p.castor_pivot_mm,
-        half_mm,
-        spin_mass,
-        p.outline_offset_mm,
+        m=robot.mass_kg,
+        I=robot.body_inertia_kg_mm2,
+        d=robot.com_offset_mm,
+        drive_share=robot.drive_load_share,
+        castor_share=robot.castor_load_share,
+        gravity=robot.gravity_mm_s2,
+        pivot=robot.castor_pivot_mm,
+        h=half_mm,
+        spin_mass=spin_mass,
+        outline_behind=robot.outline_offset_mm,
     )
+    on = robot.joint_friction
     return Body(
-        *mass,
-        p.fork_inertia_kg_mm2,
-        p.wheel_inertia_kg_mm2,
-        p.castor_inertia_kg_mm2,
-        p.wheel_radius_mm,
-        p.castor_radius_mm,
-        half_mm,
-        p.castor_trail_mm,
-        p.wheel_radius_mm**2 / p.wheel_inertia_kg_mm2,
-        p.castor_radius_mm**2 / p.castor_inertia_kg_mm2,
-        spin_mass,
-        p.castor_inertia_kg_mm2 / p.castor_radius_mm**2,
-        1 / p.fork_inertia_kg_mm2,
-        1 / p.wheel_inertia_kg_mm2,
-        1 / p.castor_inertia_kg_mm2,
-        p.torque_limit_Nmm * MILLINEWTON_PER_NEWTON,
-        p.outline_radius_mm,
-        p.gravity_mm_s2,
-        p.castor_pivot_mm,
-        p.outline_offset_mm,
-        p.tyre.mu_static,
-        p.tyre.mu_dynamic,
-        p.tyre.stiction_speed_mm_s,
-        p.tyre.dynamic_speed_mm_s,
-        *_joint_row(p.drive_joint, enabled=p.joint_friction),
-        *_joint_row(p.castor_joint, enabled=p.joint_friction),
-        *_joint_row(p.steering_joint, enabled=p.joint_friction),
-        p.steering_joint.pin_radius_mm,
+        **mass._asdict(),
+        I_s=robot.fork_inertia_kg_mm2,
+        J=robot.wheel_inertia_kg_mm2,
+        J_c=robot.castor_inertia_kg_mm2,
+        R=robot.wheel_radius_mm,
+        R_c=robot.castor_radius_mm,
+        h=half_mm,
+        T=robot.castor_trail_mm,
+        spin_drive=robot.wheel_radius_mm**2 / robot.wheel_inertia_kg_mm2,
+        spin_castor=robot.castor_radius_mm**2 / robot.castor_inertia_kg_mm2,
+        spin_mass_drive=spin_mass,
+        spin_mass_castor=robot.castor_inertia_kg_mm2 / robot.castor_radius_mm**2,
+        inverse_I_s=1 / robot.fork_inertia_kg_mm2,
+        inverse_J=1 / robot.wheel_inertia_kg_mm2,
+        inverse_J_c=1 / robot.castor_inertia_kg_mm2,
+        torque_limit=robot.torque_limit_Nmm * MILLINEWTON_PER_NEWTON,
+        outline_radius=robot.outline_radius_mm,
+        gravity=robot.gravity_mm_s2,
+        pivot=robot.castor_pivot_mm,
+        outline_behind=robot.outline_offset_mm,
+        mu_static=robot.tyre.mu_static,
+        mu_dynamic=robot.tyre.mu_dynamic,
+        stiction_speed=robot.tyre.stiction_speed_mm_s,
+        dynamic_speed=robot.tyre.dynamic_speed_mm_s,
+        **_prefixed("drive", _joint_row(robot.drive_joint, enabled=on)),
+        **_prefixed("axle", _joint_row(robot.castor_joint, enabled=on)),
+        **_prefixed("steer", _joint_row(robot.steering_joint, enabled=on)),
+        steer_pin=robot.steering_joint.pin_radius_mm,
     )
 
 
 def body_array(robots: list[RobotParameters], lanes: int = 1) -> np.ndarray:
     """Constants of a formation, ``(field, robot, lane)``, every lane alike."""
-    rows = np.array([body(p) for p in robots], dtype=np.float64)
+    rows = np.array([body(robot) for robot in robots], dtype=np.float64)
     return np.ascontiguousarray(np.repeat(rows.T[:, :, None], lanes, axis=2))

@@ -126,6 +126,20 @@ def rolling(
     )
     return (
         rolls,
-        Rates(v_e, v_f, w, s, omega_l, omega_r, omega_c),
-        Contact(p_e, p_lf, p_e, p_rf, p_cx, p_cy, q_l, q_r, q_c, q_s, 0.0, 0.0, 0.0),
+        Rates(v_e=v_e, v_f=v_f, w=w, s=s, omega_l=omega_l, omega_r=omega_r, omega_c=omega_c),
+        Contact(
+            p_le=p_e,
+            p_lf=p_lf,
+            p_re=p_e,
+            p_rf=p_rf,
+            p_cx=p_cx,
+            p_cy=p_cy,
+            q_l=q_l,
+            q_r=q_r,
+            q_c=q_c,
+            q_s=q_s,
+            slip_l=0.0,
+            slip_r=0.0,
+            slip_c=0.0,
+        ),
     )

@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.rows import replacing
 from tlf_env.numerics.trig import sincos
 from tlf_env.physics.parameters import Body
 
@@ -80,6 +81,7 @@ read_motion = reader(Motion)
 write_motion = writer(Motion)
 read_contact = reader(Contact)
 write_contact = writer(Contact)
+with_pose = replacing(Motion, "x", "y", "theta")
 
 
 @law
@@ -98,20 +100,11 @@ def forward_and_yaw(motion: Motion) -> tuple[float, float]:
 @law
 def advance_pose(motion: Motion, dt: float) -> Motion:
     """Pose one substep on, added up exactly as Chipmunk does: p + v·dt, θ + w·dt."""
-    return Motion(
-        motion.x + motion.v_x * dt,
-        motion.y + motion.v_y * dt,
-        motion.theta + motion.w * dt,
-        motion.psi,
-        motion.v_x,
-        motion.v_y,
-        motion.w,
-        motion.s,
-        motion.omega_l,
-        motion.omega_r,
-        motion.omega_c,
-        motion.angle_l,
-        motion.angle_r,
+    return with_pose(
+        motion,
+        x=motion.x + motion.v_x * dt,
+        y=motion.y + motion.v_y * dt,
+        theta=motion.theta + motion.w * dt,
     )
 
 

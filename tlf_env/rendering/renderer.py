@@ -240,7 +240,15 @@ class Renderer:
         spare = width - (high[0] - low[0]) * scale
         left = low[0] - max(spare / 2, min(spare, TABLE_PX * pen)) / scale
         top = (low[1] + high[1] + height / scale) / 2
-        return View(0, 0, width, height, (float(left), float(top)), float(scale), pen)
+        return View(
+            left=0,
+            top=0,
+            width=width,
+            height=height,
+            corner_mm=(float(left), float(top)),
+            scale=float(scale),
+            pen=pen,
+        )
 
     def _draw_background(self) -> Any:
         self._view = self._fit()
@@ -400,7 +408,15 @@ class Renderer:
         middle_y = float(scene.y_mm[i] - back_mm * np.cos(scene.theta_rad[i]))
         corner_mm = (middle_x - extent_mm / 2, middle_y + extent_mm / 2)
         pen = CLOSE_UP_PEN * self._view.pen
-        return View(left, top, side, side, corner_mm, side / extent_mm, pen)
+        return View(
+            left=left,
+            top=top,
+            width=side,
+            height=side,
+            corner_mm=corner_mm,
+            scale=side / extent_mm,
+            pen=pen,
+        )
 
     def _draw_close_up(self, scene: Scene) -> None:
         i = self._focus
