@@ -63,9 +63,15 @@ read_estimate = reader(Estimate)
 write_estimate = writer(Estimate)
 
 
-def ekf_constants(p: EkfParameters) -> Ekf:
+def ekf_constants(parameters: EkfParameters) -> Ekf:
     """The filter's numbers as the compiled law takes them."""
-    return Ekf(p.alpha_1, p.alpha_2, p.alpha_3, p.alpha_4, p.fix_variance_mm2)
+    return Ekf(
+        alpha_1=parameters.alpha_1,
+        alpha_2=parameters.alpha_2,
+        alpha_3=parameters.alpha_3,
+        alpha_4=parameters.alpha_4,
+        variance=parameters.fix_variance_mm2,
+    )
 
 
 @law

@@ -74,7 +74,7 @@ class ControllerRow(NamedTuple):
 
 
 def controller_row(
-    known: Controller, period_s: float, preview_s: tuple[float, ...] = ()
+    controller: Controller, period_s: float, preview_s: tuple[float, ...] = ()
 ) -> ControllerRow:
     """Gains and limits for a control period and preview times (s), as the compiled law takes them.
 
@@ -83,15 +83,15 @@ def controller_row(
     ValueError
         if there is a lead and no preview to make it from.
     """
-    if known.lead_s and not (preview_s and preview_s[0] > 0):
+    if controller.lead_s and not (preview_s and preview_s[0] > 0):
         raise ValueError(
-            f"lead_s {known.lead_s} needs a first preview above 0, got preview_s {preview_s}"
+            f"lead_s {controller.lead_s} needs a first preview above 0, got preview_s {preview_s}"
         )
-    lead = known.lead_s / preview_s[0] if known.lead_s else 0.0
+    lead = controller.lead_s / preview_s[0] if controller.lead_s else 0.0
     return ControllerRow(
-        gains_row(known.gains),
-        twist_limits_row(known.limits, period_s),
-        spacing_row(known.spacing),
+        gains_row(controller.gains),
+        twist_limits_row(controller.limits, period_s),
+        spacing_row(controller.spacing),
         lead,
     )
 

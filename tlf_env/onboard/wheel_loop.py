@@ -47,16 +47,18 @@ read_loop_state = reader(WheelLoopState)
 write_loop_state = writer(WheelLoopState)
 
 
-def digital_wheel_loop(p: WheelLoopParameters, dt_s: float) -> WheelLoopRow:
+def digital_wheel_loop(parameters: WheelLoopParameters, dt_s: float) -> WheelLoopRow:
     """Eq. (13) at a period of ``dt_s`` s: exact decay of the lag, and the current error already in."""
-    integral = p.gain_Nmm_s * p.zeros_0 / p.pole_rad_s
-    lag = -p.gain_Nmm_s * (p.pole_rad_s**2 - p.zeros_1 * p.pole_rad_s + p.zeros_0) / p.pole_rad_s
-    decay = math.exp(-p.pole_rad_s * dt_s)
+    k, p = parameters.gain_Nmm_s, parameters.pole_rad_s
+    a_1, a_0 = parameters.zeros_1, parameters.zeros_0
+    integral = k * a_0 / p
+    lag = -k * (p**2 - a_1 * p + a_0) / p
+    decay = math.exp(-p * dt_s)
     return WheelLoopRow(
-        p.gain_Nmm_s * MILLINEWTON_PER_NEWTON,
-        integral * dt_s * MILLINEWTON_PER_NEWTON,
-        decay,
-        lag * (1 - decay) / p.pole_rad_s * MILLINEWTON_PER_NEWTON,
+        gain=k * MILLINEWTON_PER_NEWTON,
+        integral_step=integral * dt_s * MILLINEWTON_PER_NEWTON,
+        lag_decay=decay,
+        lag_step=lag * (1 - decay) / p * MILLINEWTON_PER_NEWTON,
     )
 
 

@@ -73,9 +73,9 @@ PREDECESSOR = Tracking._fields.index("predecessor_forward")
 
 
 @law
-def clipped_action(a: float) -> float:
-    """An action's component within [−1, 1]."""
-    return min(max(a, -1.0), 1.0)
+def clipped_action(component: float) -> float:
+    """A component of an action, clipped to [−1, 1]."""
+    return min(max(component, -1.0), 1.0)
 
 
 @law

@@ -72,26 +72,26 @@ def _motor_torque(
     Forward: m_eff·u̇₁ + m·d·u₂² + castor's axle; yaw about c: I·u̇₂ − m·d·u₁·u₂ and, in a turn, all
     that the castor's steering friction resists; joints by eq. (5), u₁·u₂ at most what the tyres hold.
     """
-    b = body(robot)
+    row = body(robot)
     u_1, u_2 = np.asarray(u_1), np.asarray(u_2)
     held = grip_acceleration(robot)[0]
     lateral = np.clip(u_1 * u_2, -held, held)
-    joint = b.drive_mu_dynamic * (
-        (b.drive_axial + b.drive_bending * b.R) * b.m * np.abs(lateral) / 2
-        + b.drive_radial * b.load_drive
-        + b.drive_preload
+    joint = row.drive_mu_dynamic * (
+        (row.drive_axial + row.drive_bending * row.R) * row.m * np.abs(lateral) / 2
+        + row.drive_radial * row.load_drive
+        + row.drive_preload
     )
-    castor = b.axle_mu_dynamic * (b.axle_radial * b.load_castor + b.axle_preload) / b.R_c
-    steering = b.steer_mu_static * (
-        (b.steer_axial + b.steer_bending * b.T) * b.load_castor + b.steer_preload
+    castor = row.axle_mu_dynamic * (row.axle_radial * row.load_castor + row.axle_preload) / row.R_c
+    steering = row.steer_mu_static * (
+        (row.steer_axial + row.steer_bending * row.T) * row.load_castor + row.steer_preload
     )
-    swing = steering * (b.d + b.q + b.T) / b.T * (np.abs(u_2) > TURNS_RAD_S)
-    mass = b.m + 2 * b.spin_mass_drive + b.spin_mass_castor
-    forward = mass * np.asarray(acceleration) + b.m * b.d * u_2**2 + castor
-    yaw = b.I_rolling * np.asarray(yaw_acceleration) - b.m * b.d * lateral
+    swing = steering * (row.d + row.q + row.T) / row.T * (np.abs(u_2) > TURNS_RAD_S)
+    mass = row.m + 2 * row.spin_mass_drive + row.spin_mass_castor
+    forward = mass * np.asarray(acceleration) + row.m * row.d * u_2**2 + castor
+    yaw = row.I_rolling * np.asarray(yaw_acceleration) - row.m * row.d * lateral
     torques = [
-        joint * np.where(u_1 + side * b.h * u_2 < 0, -1.0, 1.0)
-        + b.R / 2 * (forward + (side * yaw + sign * swing) / b.h)
+        joint * np.where(u_1 + side * row.h * u_2 < 0, -1.0, 1.0)
+        + row.R / 2 * (forward + (side * yaw + sign * swing) / row.h)
         for side in (-1.0, 1.0)
         for sign in (-1.0, 1.0)
     ]
@@ -226,9 +226,9 @@ def _times(horizon_s: float, time_gap_s: float) -> tuple[np.ndarray, int]:
     return (t_s if len(t_s) >= 2 else np.array([0.0, horizon_s])), gap_steps
 
 
-def _place(t_s: np.ndarray, reference: np.ndarray, k: int) -> str:
-    x, y = reference[k, :2]
-    return f"t = {t_s[k]:.2f} s at ({x:.0f}, {y:.0f}) mm"
+def _place(t_s: np.ndarray, reference: np.ndarray, index: int) -> str:
+    x, y = reference[index, :2]
+    return f"t = {t_s[index]:.2f} s at ({x:.0f}, {y:.0f}) mm"
 
 
 def _first(flags: np.ndarray) -> int:

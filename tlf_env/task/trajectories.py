@@ -234,7 +234,7 @@ class Waypoints(_Timed):
     def _check(cls, points: Any) -> tuple[Point, ...]:
         if not isinstance(points, list | tuple):
             raise ValueError(f"points must be a list of (t_s, x_mm, y_mm), got {points!r:.60}")
-        return checked_points(points, "points", lambda i: f"points[{i}]")
+        return checked_points(points, "points", lambda index: f"points[{index}]")
 
     @model_validator(mode="after")
     def _try(self) -> Self:

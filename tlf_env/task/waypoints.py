@@ -57,7 +57,7 @@ def read_points(path: Path) -> tuple[Point, ...]:
     if not rows or tuple(rows[0]) != HEADER:
         found = repr(",".join(rows[0]))[:60] if rows else "an empty file"
         raise ValueError(f"{path}, line 1: the header must be {','.join(HEADER)}, got {found}")
-    return checked_points(rows[1:], str(path), lambda i: f"{path}, line {lines[i + 1]}")
+    return checked_points(rows[1:], str(path), lambda index: f"{path}, line {lines[index + 1]}")
 
 
 def checked_points(
