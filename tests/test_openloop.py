@@ -70,7 +70,7 @@ def test_a_file_that_is_not_json_is_refused(tmp_path, content):
 
 @pytest.mark.parametrize("data", [[], [RUN], 3, "text", None, {}])
 def test_a_file_without_named_scenarios_is_refused(tmp_path, data):
-    assert "must hold an object of named scenarios" in refused(tmp_path, data)
+    assert "must contain an object of named scenarios" in refused(tmp_path, data)
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../up", "a/b", ".hidden"])
@@ -256,7 +256,7 @@ def test_the_refusal_names_the_offset_that_fits():
 
 
 def test_loads_that_do_not_add_up_are_refused():
-    with pytest.raises(ValidationError, match="the three wheels carry 1"):
+    with pytest.raises(ValidationError, match="it must be 1"):
         RobotParameters(drive_load_share=0.45)
 
 

@@ -1,4 +1,4 @@
-"""Frozen, validated models, and the kinds of number that they hold."""
+"""Frozen, validated models, and the types of their numbers."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 
 
 def no_switch(value: Any) -> Any:
-    """The value, unless it is True or False, which Python would count as 1 or 0.
+    """The value; True and False are refused, which Python would take as 1 and 0.
 
     Raises
     ------
@@ -31,6 +31,6 @@ NonNegative = Annotated[FiniteFloat, BeforeValidator(no_switch), Field(ge=0)]
 
 
 class Frozen(BaseModel):
-    """A model whose instances never change and that refuses unknown keys."""
+    """A model with immutable instances that refuses unknown keys."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", validate_default=True)

@@ -11,8 +11,8 @@ from tlf_env.numerics.compiled import law
 def replacing(row: type[Any], *names: str) -> Callable[..., Any]:
     """Compiled ``replace(old, name=value, ...)``: a copy of a row with new values in these fields.
 
-    All fields that are not named are copied, so that a field added to the row needs no edit where it
-    does not change.
+    The other fields are copied, so that a field added to the row needs no edit where it does not
+    change.
 
     Raises
     ------

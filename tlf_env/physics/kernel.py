@@ -1,7 +1,7 @@
 """The wheel kernel: one substep of one robot, implicit in all friction (``docs/physics.md``).
 
-Frames are taken at mid attitude; torques and pushes enter as impulses; then the impulses of floor and
-friction follow, in closed form where all wheels roll (:func:`roll`) and by sweeps where not (:func:`slide`).
+Frames are taken at mid attitude, and torques and pushes enter as impulses. Then the impulses of floor and
+friction are solved: in closed form if all wheels roll (:func:`roll`), otherwise by sweeps (:func:`slide`).
 """
 
 from __future__ import annotations
@@ -21,14 +21,14 @@ with_torques = replacing(Rates, "w", "omega_l", "omega_r")
 
 
 class SubstepFrame(NamedTuple):
-    """What the impulses of floor and friction are solved for."""
+    """Data of a substep from which the impulses of floor and friction are solved."""
 
     sin_t: float  # heading at mid attitude
     cos_t: float
     sin_p: float  # castor angle at mid attitude
     cos_p: float
-    before: Rates  # velocities at the substep's start
-    free: Rates  # the same, with torques and pushes
+    before: Rates  # velocities at the start of the substep
+    free: Rates  # with torques and pushes, without floor and friction
     limits: FrictionLimits
 
 
@@ -43,7 +43,7 @@ def substep_frame(
     torque_r: float,
     dt: float,
 ) -> SubstepFrame:
-    """Frames at mid attitude, velocities without floor and friction, and the friction's limits."""
+    """Frames at mid attitude, velocities without floor and friction, and limits of the friction impulses."""
     sin_t, cos_t = sincos(motion.theta + 0.5 * dt * motion.w)
     sin_p, cos_p = sincos(motion.psi - motion.theta + 0.5 * dt * (motion.s - motion.w))
     v_x = motion.v_x + push.f_x * dt * body.inverse_m
@@ -76,7 +76,7 @@ def substep_frame(
 
 @law
 def moved(motion: Motion, frame: SubstepFrame, after: Rates, dt: float) -> Motion:
-    """The motion with new velocities, in world axes; fork and wheel angles advanced with them."""
+    """The motion with new velocities, in world axes; fork and wheel angles are advanced with them."""
     return Motion(
         x=motion.x,
         y=motion.y,
@@ -105,7 +105,7 @@ def roll(
     torque_r: float,
     dt: float,
 ) -> tuple[bool, Motion, Contact]:
-    """A substep in closed form, and whether it holds: whether all three wheels roll."""
+    """Whether all three wheels roll, and the substep in closed form, which is valid only then."""
     frame = substep_frame(body, motion, contact, floor, push, torque_l, torque_r, dt)
     rolls, after, impulses = rolling(
         body, frame.free, frame.before, frame.cos_p, frame.sin_p, floor, frame.limits
@@ -124,7 +124,7 @@ def slide(
     torque_r: float,
     dt: float,
 ) -> tuple[Motion, Contact]:
-    """A substep by sweeps, right whatever the wheels do."""
+    """A substep by sweeps, valid whether the wheels roll or slide."""
     frame = substep_frame(body, motion, contact, floor, push, torque_l, torque_r, dt)
     after, impulses = sweep(
         body, frame.free, contact, frame.cos_p, frame.sin_p, floor, frame.limits
@@ -143,9 +143,9 @@ def substep(
     torque_r: float,
     dt: float,
 ) -> tuple[Motion, Contact]:
-    """Velocities after one substep; the pose is left to :func:`tlf_env.physics.state.advance_pose`.
+    """Velocities after one substep; :func:`tlf_env.physics.state.advance_pose` advances the pose.
 
-    Torques in mN·mm, ``dt`` in s. Fork and wheel angles are advanced here with the new rates.
+    Torques in mN·mm, ``dt`` in s. Fork and wheel angles are advanced here, with the new rates.
     """
     rolls, after, impulses = roll(body, motion, contact, floor, push, torque_l, torque_r, dt)
     if rolls:

@@ -33,7 +33,7 @@ def follow_wheels(
 ) -> Motion:
     """The ``kinematic`` plant: wheels follow their command exactly, eqs (1) and (14) over one substep.
 
-    By the midpoint rule about c; the castor trails along.
+    Integrated with the midpoint rule about c; the castor wheel rolls without slip.
     """
     u_1 = 0.5 * body.R * (omega_l + omega_r) + delta_1
     u_2 = 0.5 * body.R / body.h * (omega_r - omega_l) + delta_2
@@ -44,7 +44,7 @@ def follow_wheels(
     y += dt * u_1 * cos
     theta = motion.theta + dt * u_2
     sin, cos = sincos(theta)
-    # The fork turns so that its wheel rolls: its axle sees no velocity along itself.
+    # The fork turns so that its wheel rolls: no velocity along the castor's axle.
     sin_phi, cos_phi = sincos(motion.psi - motion.theta)
     s = -(u_2 * (body.q + body.d) * cos_phi + u_1 * sin_phi) / body.T
     return Motion(

@@ -1,4 +1,4 @@
-"""The plant linearised about steady rolling, for control design with python-control and the like."""
+"""The plant linearised about steady rolling, for control design, for example with python-control."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ ENDLESS_GRIP = FrictionCurve(
 
 
 class LinearPlant(NamedTuple):
-    """ẋ = A x + B u, y = C x + D u, deviations from the operating point.
+    """ẋ = A x + B u, y = C x + D u for deviations from the operating point.
 
     x: :data:`STATES`; u: :data:`INPUTS`; y: :data:`OUTPUTS`. ``state`` and ``torques_Nmm`` are the
     operating point.
@@ -35,10 +35,10 @@ class LinearPlant(NamedTuple):
     C: np.ndarray  # (2, 3)
     D: np.ndarray  # (2, 2)
     state: np.ndarray  # (3,)
-    torques_Nmm: np.ndarray  # (2,) that hold it, friction left out
+    torques_Nmm: np.ndarray  # (2,) steady torques, without friction
 
     def to_control(self) -> Any:
-        """The same as a ``control.StateSpace`` with named signals (needs python-control)."""
+        """The model as a ``control.StateSpace`` with named signals (needs python-control)."""
         import control
 
         return control.ss(
@@ -55,7 +55,7 @@ class LinearPlant(NamedTuple):
 def _rolling_motion(robot: Body, forward: float, yaw: float, castor: float) -> Motion:
     """The motion with all wheels rolling at a state, at the origin, heading 0.
 
-    As the substep before would have left it: rolling in its own frames, which lie half a substep back.
+    It is the result of a previous substep: the wheels roll in frames that lie half a substep back.
     """
     pivot = robot.d + robot.q
     fork_rate = -(pivot * yaw * math.cos(castor) + forward * math.sin(castor)) / robot.T
@@ -102,19 +102,21 @@ def _rates(robot: Body, state: np.ndarray, torques_Nmm: np.ndarray) -> np.ndarra
 def linearise(
     robot: RobotParameters | None = None, u_1_mm_s: float = 300.0, u_2_rad_s: float = 0.0
 ) -> LinearPlant:
-    """The rolling robot about a steady speed and yaw rate, dry friction left out.
+    """The rolling robot about a steady speed and yaw rate, without dry friction.
 
     Joint friction is set-valued and has no derivative; as in eqs (6) and (7) of the paper it is a
-    disturbance at the input. With a forward speed the castor trails and a centre of mass behind the
-    axle makes the yaw mode unstable.
+    disturbance at the input. In forward motion the castor trails, and a centre of mass behind the axle
+    makes the yaw mode unstable.
 
     Raises
     ------
     ValueError
-        for a speed that is not positive, or a curve so tight that the castor would leave its trail.
+        for a speed that is not positive, or a curve so tight that the castor cannot trail.
     """
     if not math.isfinite(u_1_mm_s) or u_1_mm_s <= 0:
-        raise ValueError(f"u_1_mm_s {u_1_mm_s} must be above 0: a standing castor has no direction")
+        raise ValueError(
+            f"u_1_mm_s {u_1_mm_s} must be above 0: at rest the castor has no direction"
+        )
     robot = robot or RobotParameters()
     row = body(robot.model_copy(update={"joint_friction": False, "tyre": ENDLESS_GRIP}))
     # φ̇ = 0: the fork turns with the body, u₂(a cos φ + T) + u₁ sin φ = 0, a tangent to a circle.

@@ -1,4 +1,4 @@
-"""Every number of the robot's body: Table I of the paper, and the values chosen where it is silent.
+"""Parameters of the robot's body: Table I of the paper, and chosen values for what is not in it.
 
 Units: mm, kg, s, rad; torques and torque limits N·mm; inertias kg·mm².
 """
@@ -18,10 +18,10 @@ LOAD_SPLIT_TOLERANCE = 1e-9
 
 
 class FrictionCurve(Frozen):
-    """Friction coefficient against speed (paper, Fig. 3b): static, then a smooth fall to dynamic.
+    """Friction coefficient against speed (paper, Fig. 3b): static, then a smooth decrease to dynamic.
 
-    ``mu_static`` holds up to ``stiction_speed_mm_s`` (v_s), ``mu_dynamic`` from ``dynamic_speed_mm_s``
-    (v_d) on. At zero speed the law is set-valued: true stick.
+    ``mu_static`` applies up to ``stiction_speed_mm_s`` (v_s), ``mu_dynamic`` above
+    ``dynamic_speed_mm_s`` (v_d). At zero speed the law is set-valued: true stiction.
     """
 
     mu_static: NonNegative
@@ -33,7 +33,7 @@ class FrictionCurve(Frozen):
     def _check(self) -> Self:
         if self.mu_dynamic > self.mu_static:
             raise ValueError(
-                f"mu_dynamic {self.mu_dynamic} is above mu_static {self.mu_static}; it must not be"
+                f"mu_dynamic {self.mu_dynamic} must be at most mu_static {self.mu_static}"
             )
         if self.dynamic_speed_mm_s <= self.stiction_speed_mm_s:
             raise ValueError(
@@ -44,13 +44,13 @@ class FrictionCurve(Frozen):
 
 
 class JointFriction(FrictionCurve):
-    """Friction torque of a revolute joint, eq. (5); the switches of Table I are explicit here."""
+    """Friction torque of a revolute joint, eq. (5), with the on/off settings of Table I."""
 
     friction_arm_mm: NonNegative  # R_n, lever of the axial force
     pin_radius_mm: NonNegative  # R_p, lever of the radial force
     bending_arm_mm: Positive  # R_b, divides the bending moment
-    preload_Nmm: NonNegative = 0.0  # T_pre, off in Table I
-    bending: bool = True  # Table I: bending moment on
+    preload_Nmm: NonNegative = 0.0  # T_pre; off in Table I
+    bending: bool = True  # friction from the bending moment; on in Table I
 
 
 def _joint(
@@ -71,15 +71,15 @@ def _joint(
 class RobotParameters(Frozen):
     """One robot: chassis, two drive wheels, castor fork, castor wheel.
 
-    The centre of mass lies ``com_offset_mm`` behind the axle's midpoint c; the castor's pivot lies
-    ``castor_pivot_mm`` behind c and its floor contact ``castor_trail_mm`` behind the pivot.
+    The centre of mass lies ``com_offset_mm`` behind the axle midpoint c, the castor's pivot
+    ``castor_pivot_mm`` behind c, and its floor contact ``castor_trail_mm`` behind the pivot.
     Fields marked *chosen* are not in the paper.
 
     Raises
     ------
     pydantic.ValidationError
-        (a ValueError) for a value outside its range, an unknown field, or loads that do not fit the
-        place of the centre of mass.
+        (a ValueError) for a value outside its range, an unknown field, or wheel loads that contradict
+        the position of the centre of mass.
     """
 
     # Table I
@@ -103,7 +103,7 @@ class RobotParameters(Frozen):
     outline_offset_mm: FiniteFloat = 30.0  # centre of the outline's circle, behind c
     # footnote 4
     torque_limit_Nmm: Positive = 15.0
-    # Table I; the tyres' v_d is missing there: 1.5 v_s, as for the joints
+    # Table I; it does not give the tyres' v_d: 1.5 v_s, as for the joints
     tyre: FrictionCurve = FrictionCurve(
         mu_static=0.073, mu_dynamic=0.055, stiction_speed_mm_s=2.0, dynamic_speed_mm_s=3.0
     )
@@ -116,9 +116,7 @@ class RobotParameters(Frozen):
     def _check_loads(self) -> Self:
         total = 2 * self.drive_load_share + self.castor_load_share
         if abs(total - 1) > LOAD_SPLIT_TOLERANCE:
-            raise ValueError(
-                f"2·drive_load_share + castor_load_share is {total}; the three wheels carry 1"
-            )
+            raise ValueError(f"2·drive_load_share + castor_load_share is {total}; it must be 1")
         base_mm = self.castor_pivot_mm + self.castor_trail_mm
         needed_mm = self.castor_load_share * base_mm
         if abs(needed_mm - self.com_offset_mm) > LOAD_SPLIT_TOLERANCE * base_mm:
@@ -131,7 +129,7 @@ class RobotParameters(Frozen):
 
 
 class Joint(NamedTuple):
-    """Eq. (5) in kernel units, with its constant parts gathered: T_f = μ(v)·(constant + radial + bending).
+    """Eq. (5) in kernel units, with constant parts combined: T_f = μ(v)·(constant + radial + bending).
 
     ``axial`` (mm) multiplies the axial force, ``radial`` (mm) the radial one, ``bending`` the bending
     moment; ``preload`` is in mN·mm.
@@ -148,7 +146,7 @@ class Joint(NamedTuple):
 
 
 class Mass(NamedTuple):
-    """What a payload changes of a :class:`Body`: its first fields, in the same order."""
+    """The constants that a payload changes: the first fields of :class:`Body`, in the same order."""
 
     m: float
     I: float  # noqa: E741  the symbol of the equations
@@ -166,10 +164,10 @@ class Mass(NamedTuple):
 
 
 class Body(NamedTuple):
-    """One robot as the kernel reads it: mN, mm, kg, s; inverse masses computed once.
+    """Constants of one robot for the kernel, in mN, mm, kg, s; inverse masses are computed once.
 
-    Names as in ``docs/physics.md``: h half the axle width, d centre of mass behind c, q pivot behind
-    the centre of mass, T trail, subscripts e right, f forward.
+    Names as in ``docs/physics.md``: h half the axle width, d distance of the centre of mass behind c, q
+    distance of the pivot behind the centre of mass, T trail; subscripts e to the right, f forward.
     """
 
     # the fields of Mass
@@ -186,7 +184,7 @@ class Body(NamedTuple):
     inverse_m: float
     inverse_I: float
     outline_ahead: float
-    # what no payload changes
+    # not changed by a payload
     I_s: float
     J: float
     J_c: float
@@ -270,7 +268,7 @@ def weighed(
     spin_mass: float,
     outline_behind: float,
 ) -> Mass:
-    """What follows from mass, inertia, centre of mass and each wheel's share of the weight."""
+    """Constants that follow from mass, inertia, centre of mass and each wheel's share of the weight."""
     weight = m * gravity
     inverse_m, inverse_I = 1.0 / m, 1.0 / I
     return Mass(
@@ -295,10 +293,10 @@ compiled_weighed = law(weighed)
 
 @law
 def laden(empty: Body, mass: float, behind: float, inertia: float) -> Mass:
-    """The robot with a payload (kg, mm behind c, kg·mm² about its own centre).
+    """Constants of the robot with a payload (kg, mm behind c, kg·mm² about the payload's centre).
 
-    The wheels can carry it while the common centre of mass, ``d``, lies above their base:
-    from 0 to ``pivot + T``.
+    The wheels can carry the payload if the common centre of mass ``d`` lies above their base, between 0
+    and ``pivot + T``.
     """
     m = empty.m + mass
     d = (empty.m * empty.d + mass * behind) / m
@@ -368,6 +366,6 @@ def body(robot: RobotParameters) -> Body:
 
 
 def body_array(robots: list[RobotParameters], lanes: int = 1) -> np.ndarray:
-    """Constants of a formation, ``(field, robot, lane)``, every lane alike."""
+    """Constants of a formation, ``(field, robot, lane)``, the same in every lane (formation of a batch)."""
     rows = np.array([body(robot) for robot in robots], dtype=np.float64)
     return np.ascontiguousarray(np.repeat(rows.T[:, :, None], lanes, axis=2))

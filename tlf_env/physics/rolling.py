@@ -1,11 +1,10 @@
 """The closed form of a substep in which all three wheels roll and their axles turn.
 
-Without slip the robot has two velocities, v_f and w (one while the steering sticks); everything else
-follows from them. Gauss's principle picks them: they minimise the mass-weighted distance to the
-velocities that the bodies would have without the floor. Then the floor's impulses follow, and the
-guess is tested: impulses within their circles, every friction opposing its motion. For frozen limits
-the velocities that pass are the only ones, so the sweeps of :mod:`tlf_env.physics.sweeps` would find
-the same; where the test fails they are asked.
+Without slip the robot has two independent velocities, v_f and w (one while the steering sticks). By
+Gauss's principle they minimise the mass-weighted distance to the velocities that the bodies would have
+without the floor. The floor's impulses follow from them. Then the assumption is tested: all impulses
+within their friction circles, every friction torque opposing its motion. For constant limits the solution
+is unique, so :mod:`tlf_env.physics.sweeps` would find the same; if the test fails, the sweeps are used.
 """
 
 from __future__ import annotations
@@ -30,8 +29,8 @@ def rolling(
 ) -> tuple[bool, Rates, Contact]:
     """Velocities and impulses if all wheels roll, and whether they do.
 
-    ``free`` are the velocities with torques and pushes but without floor and friction, ``before``
-    those at the substep's start: they tell which way each friction points.
+    ``free`` are the velocities with torques and pushes but without floor and friction; ``before`` those
+    at the start of the substep, which determine the direction of each friction torque.
     """
     q_l = -math.copysign(limits.axle_l, before.omega_l)
     q_r = -math.copysign(limits.axle_r, before.omega_r)
@@ -97,7 +96,7 @@ def rolling(
     v_e = w * body.d
     along_l, along_r = v_f - w * body.h, v_f + w * body.h
     along_c = v_f * cos_phi - pivot * w * sin_phi
-    # What the tyres gave so that each wheel rolls.
+    # Impulses of the tyres that make each wheel roll.
     p_lf = m_drive * (u_l - along_l)
     p_rf = m_drive * (u_r - along_r)
     p_cy = m_castor * (u_c - along_c)
