@@ -70,7 +70,9 @@ def predicted(
 
 def steady(*noise: float, variance: float, bounds: tuple[float, float]) -> SlipEkf:
     """A filter that learns nothing: process noise per sample, variance of a fix (mm²), bounds of slip."""
-    constants = CHOSEN._replace(variance=variance, least=0.0, bound_1=bounds[0], bound_2=bounds[1])
+    constants = CHOSEN._replace(
+        variance=variance, least_variance=0.0, bound_1=bounds[0], bound_2=bounds[1]
+    )
     return constants._replace(**dict(zip(SlipEkf._fields[:5], noise, strict=True)))
 
 
@@ -483,9 +485,9 @@ def test_quiet_motion_is_hardly_a_surprise(noise_mm):
 def test_who_stands_is_never_surprised():
     """Yaw slip does not show in the fixes of a robot at rest, so they say nothing about it."""
     e, z = packed(np.zeros(5), random_covariance(np.random.default_rng(8)))
-    z = z._replace(ahead=50.0, aside=50.0)
+    z = z._replace(mean_forward=50.0, mean_right=50.0)
     still = predicted(e, z, LEARNING, 0.0, 0.0, DT)
-    calm = predicted(e, z._replace(ahead=0.0, aside=0.0), LEARNING, 0.0, 0.0, DT)
+    calm = predicted(e, z._replace(mean_forward=0.0, mean_right=0.0), LEARNING, 0.0, 0.0, DT)
     np.testing.assert_array_equal(covariance(*still), covariance(*calm))
     moving = predicted(e, z, LEARNING, 400.0 * DT, 0.0, DT)
     assert moving[1].p_11 > still[1].p_11

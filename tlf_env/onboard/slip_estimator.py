@@ -78,13 +78,13 @@ class SlipEkf(NamedTuple):
     variance: float
     bound_1: float
     bound_2: float
-    learning: float  # share of a sample in the learned variance
-    least: float
-    factor: float
-    averaging: float  # share of a sample in the mean innovation
+    variance_weight: float  # share of a sample in the learned variance
+    least_variance: float
+    variance_factor: float
+    mean_weight: float  # share of a sample in the mean innovation
     threshold: float  # of the mean innovation's square, per variance of a fix
     most_surprise: float
-    fast: float  # mm per sample from which on surprise counts whole
+    surprise_speed: float  # mm per sample from which on surprise counts whole
     surprise_heading: float
     surprise_1: float
     surprise_2: float
@@ -92,8 +92,8 @@ class SlipEkf(NamedTuple):
     change_2: float  # rad per sample and sample
     grip_1: float  # likewise
     grip_2: float
-    unsure: float  # variance of slip for the square of a jump of increments, 1/s²
-    settling: float  # share of a sample in the learned roughness
+    jump_variance: float  # variance of slip for the square of a jump of increments, 1/s²
+    roughness_weight: float  # share of a sample in the learned roughness
 
 
 class SlipEstimate(NamedTuple):
@@ -116,14 +116,14 @@ class SlipEstimate(NamedTuple):
     variance: float  # of a fix, beyond where the filter began, mm²
     d_x: float  # last innovation, world axes, mm
     d_y: float
-    ahead: float  # mean innovation, forward and right, mm
-    aside: float
+    mean_forward: float  # mean innovation, forward and right, mm
+    mean_right: float
     u_1: float  # the wheels' last increments, mm and rad
     u_2: float
     spin_1: float  # what of them is spin, mm and rad
     spin_2: float
-    rough_1: float  # mean square of their changes, by encoder noise mostly
-    rough_2: float
+    roughness_1: float  # mean square of their changes, by encoder noise mostly
+    roughness_2: float
 
 
 read_slip_ekf = reader(SlipEkf)
@@ -138,7 +138,7 @@ def sample_weight(dt_s: float, time_s: float) -> float:
 
 def slip_ekf_constants(parameters: SlipEkfParameters, dt_s: float) -> SlipEkf:
     """The filter's numbers for a sampling period of ``dt_s`` s, as the compiled law takes them."""
-    averaging = sample_weight(dt_s, parameters.surprise_time_s)
+    mean_weight = sample_weight(dt_s, parameters.surprise_time_s)
     return SlipEkf(
         forward=parameters.forward_noise_mm2_s * dt_s,
         sideways=parameters.sideways_noise_mm2_s * dt_s,
@@ -148,17 +148,17 @@ def slip_ekf_constants(parameters: SlipEkfParameters, dt_s: float) -> SlipEkf:
         variance=parameters.fix_variance_mm2,
         bound_1=parameters.delta_1_bound_mm_s,
         bound_2=parameters.delta_2_bound_rad_s,
-        learning=0.0
+        variance_weight=0.0
         if parameters.fix_variance_time_s is None
         else sample_weight(dt_s, parameters.fix_variance_time_s),
-        least=parameters.least_fix_variance_mm2,
-        factor=parameters.fix_variance_factor,
-        averaging=averaging,
+        least_variance=parameters.least_fix_variance_mm2,
+        variance_factor=parameters.fix_variance_factor,
+        mean_weight=mean_weight,
         threshold=math.inf
         if parameters.surprise_threshold is None
-        else parameters.surprise_threshold * averaging / (2.0 - averaging),
+        else parameters.surprise_threshold * mean_weight / (2.0 - mean_weight),
         most_surprise=parameters.most_surprise,
-        fast=parameters.surprise_speed_mm_s * dt_s,
+        surprise_speed=parameters.surprise_speed_mm_s * dt_s,
         surprise_heading=parameters.heading_surprise_rad2_s * dt_s,
         surprise_1=parameters.delta_1_surprise_mm2_s3 * dt_s,
         surprise_2=parameters.delta_2_surprise_rad2_s3 * dt_s,
@@ -166,8 +166,8 @@ def slip_ekf_constants(parameters: SlipEkfParameters, dt_s: float) -> SlipEkf:
         change_2=infinite_if_none(parameters.most_yaw_acceleration_rad_s2, dt_s**2),
         grip_1=parameters.grip_mm_s2 * dt_s**2,
         grip_2=parameters.yaw_grip_rad_s2 * dt_s**2,
-        unsure=(parameters.jump_uncertainty / dt_s) ** 2,
-        settling=sample_weight(dt_s, ROUGHNESS_TIME_S),
+        jump_variance=(parameters.jump_uncertainty / dt_s) ** 2,
+        roughness_weight=sample_weight(dt_s, ROUGHNESS_TIME_S),
     )
 
 
@@ -208,7 +208,7 @@ def split_change(
 predicted_slip = replacing(
     SlipEstimate,
     *("delta_1", "delta_2", *POSE_AND_SLIP, "p_11", "p_22"),
-    *("u_1", "u_2", "spin_1", "spin_2", "rough_1", "rough_2"),
+    *("u_1", "u_2", "spin_1", "spin_2", "roughness_1", "roughness_2"),
 )
 
 
@@ -230,18 +230,18 @@ def predict_with_slip(
     """
     change_1, change_2 = u_1 - slip.u_1, u_2 - slip.u_2
     usual_1, jump_1, spin_1 = split_change(
-        change_1, u_1 - asked_1, slip.spin_1, ekf.change_1, slip.rough_1, ekf.grip_1
+        change_1, u_1 - asked_1, slip.spin_1, ekf.change_1, slip.roughness_1, ekf.grip_1
     )
     usual_2, jump_2, spin_2 = split_change(
-        change_2, u_2 - asked_2, slip.spin_2, ekf.change_2, slip.rough_2, ekf.grip_2
+        change_2, u_2 - asked_2, slip.spin_2, ekf.change_2, slip.roughness_2, ekf.grip_2
     )
     delta_1, delta_2 = slip.delta_1 - jump_1 / dt, slip.delta_2 - jump_2 / dt
     moved, turned = u_1 - spin_1 + delta_1 * dt, u_2 - spin_2 + delta_2 * dt
     middle = estimate.theta + 0.5 * turned
-    noise = max(ekf.variance + slip.variance, ekf.least)
-    speed = min(abs(u_1) / ekf.fast, 1.0)
-    forward = speed * speed * surprise(slip.ahead, noise, ekf)
-    sideways = speed * speed * surprise(slip.aside, noise, ekf)
+    noise = max(ekf.variance + slip.variance, ekf.least_variance)
+    speed = min(abs(u_1) / ekf.surprise_speed, 1.0)
+    forward = speed * speed * surprise(slip.mean_forward, noise, ekf)
+    sideways = speed * speed * surprise(slip.mean_right, noise, ekf)
     sin, cos = sincos(middle)
     # F = I but for ∂(x, y)/∂θ = f, ∂(x, y)/∂δ₁ = h, ∂(x, y)/∂δ₂ = g, ∂θ/∂δ₂ = dt.
     f_x, f_y = -moved * cos, -moved * sin
@@ -288,14 +288,22 @@ def predict_with_slip(
             p_x2=m_x2,
             p_y2=m_y2,
             p_t2=m_t2,
-            p_11=slip.p_11 + ekf.walk_1 + ekf.surprise_1 * forward + ekf.unsure * jump_1 * jump_1,
-            p_22=slip.p_22 + ekf.walk_2 + ekf.surprise_2 * sideways + ekf.unsure * jump_2 * jump_2,
+            p_11=slip.p_11
+            + ekf.walk_1
+            + ekf.surprise_1 * forward
+            + ekf.jump_variance * jump_1 * jump_1,
+            p_22=slip.p_22
+            + ekf.walk_2
+            + ekf.surprise_2 * sideways
+            + ekf.jump_variance * jump_2 * jump_2,
             u_1=u_1,
             u_2=u_2,
             spin_1=spin_1,
             spin_2=spin_2,
-            rough_1=slip.rough_1 + ekf.settling * (usual_1 * usual_1 - slip.rough_1),
-            rough_2=slip.rough_2 + ekf.settling * (usual_2 * usual_2 - slip.rough_2),
+            roughness_1=slip.roughness_1
+            + ekf.roughness_weight * (usual_1 * usual_1 - slip.roughness_1),
+            roughness_2=slip.roughness_2
+            + ekf.roughness_weight * (usual_2 * usual_2 - slip.roughness_2),
         ),
     )
 
@@ -303,7 +311,7 @@ def predict_with_slip(
 corrected_slip = replacing(
     SlipEstimate,
     *("delta_1", "delta_2", *POSE_AND_SLIP, "p_11", "p_12", "p_22"),
-    *("variance", "d_x", "d_y", "ahead", "aside"),
+    *("variance", "d_x", "d_y", "mean_forward", "mean_right"),
 )
 
 
@@ -316,12 +324,14 @@ def correct_with_slip(
     Returns the estimates, the innovation in world axes (mm), and its normalised square (NIS).
     """
     known = ekf.variance + slip.variance
-    i_xx, i_xy, i_yy = inverse_innovation_covariance(estimate, max(ekf.factor * known, ekf.least))
+    i_xx, i_xy, i_yy = inverse_innovation_covariance(
+        estimate, max(ekf.variance_factor * known, ekf.least_variance)
+    )
     d_x, d_y = x - estimate.x, y - estimate.y
     # Successive innovations differ by twice the variance of a fix; a slow error cancels.
     step_x, step_y = d_x - slip.d_x, d_y - slip.d_y
     sin, cos = sincos(estimate.theta)
-    ahead, aside = cos * d_y - sin * d_x, cos * d_x + sin * d_y
+    forward, right = cos * d_y - sin * d_x, cos * d_x + sin * d_y
     # The gain's rows x, y, θ, and those of δ₁ and δ₂.
     gain = pose_gain(estimate, i_xx, i_xy, i_yy)
     l_1x, l_1y = slip.p_x1 * i_xx + slip.p_y1 * i_xy, slip.p_x1 * i_xy + slip.p_y1 * i_yy
@@ -344,11 +354,11 @@ def correct_with_slip(
             p_11=slip.p_11 - l_1x * slip.p_x1 - l_1y * slip.p_y1,
             p_12=slip.p_12 - l_1x * slip.p_x2 - l_1y * slip.p_y2,
             p_22=slip.p_22 - l_2x * slip.p_x2 - l_2y * slip.p_y2,
-            variance=slip.variance + ekf.learning * (0.25 * step_2 - known),
+            variance=slip.variance + ekf.variance_weight * (0.25 * step_2 - known),
             d_x=d_x,
             d_y=d_y,
-            ahead=slip.ahead + ekf.averaging * (ahead - slip.ahead),
-            aside=slip.aside + ekf.averaging * (aside - slip.aside),
+            mean_forward=slip.mean_forward + ekf.mean_weight * (forward - slip.mean_forward),
+            mean_right=slip.mean_right + ekf.mean_weight * (right - slip.mean_right),
         ),
         d_x,
         d_y,
