@@ -17,7 +17,7 @@ import typer
 from baselines import ReferencePolicy
 from baselines.runs.run import run_policy
 from tlf_env import load_scenario
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 
 POSITION_GAIN_PER_S = 8.0
 HEADING_GAIN_RAD_S_MM = 0.02  # correction of the heading per lateral deviation of a fix

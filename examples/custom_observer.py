@@ -20,7 +20,7 @@ from baselines import ReferencePolicy
 from baselines.runs.run import run_policy
 from tlf_env import load_scenario
 from tlf_env.onboard.observer import Message, Reference
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 
 BLEND_S = 5.0
 

@@ -15,7 +15,7 @@ import typer
 from baselines import ReferencePolicy
 from baselines.runs.run import run_policy
 from tlf_env import load_scenario
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 
 GAIN_NMM_S = 150.0  # N·mm per rad/s
 INTEGRAL_TIME_S = 0.2

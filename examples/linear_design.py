@@ -18,7 +18,7 @@ import typer
 
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.linear import LinearPlant, linearise
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 
 PERIOD_S = 0.001
 KG_MM2_S2_PER_NMM = 1000.0

@@ -19,7 +19,6 @@ from tlf_env.onboard.estimator import (
     Estimate,
     correct,
     ekf_constants,
-    odometry,
     predict,
     read_estimate,
     write_estimate,
@@ -33,21 +32,20 @@ from tlf_env.onboard.tracking import (
     tracking_twist,
 )
 from tlf_env.onboard.wheel_loop import (
-    WheelLoop,
+    WheelLoopRow,
     WheelLoopState,
     digital_wheel_loop,
     read_loop_state,
     wheel_torque,
     write_loop_state,
 )
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, body_array
-from tlf_env.physics.state import read_body
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.vehicle import body_array, odometry, read_body, wheel_speeds
 from tlf_env.task.actions import (
     ACTION_SIZE,
     FULL_SPEED_MM_S,
     FULL_TORQUE_NMM,
     FULL_YAW_RATE_RAD_S,
-    wheel_speeds,
 )
 from tlf_env.task.observation import SAMPLE_ENTRIES, SensorTail, sensor_entries
 from tlf_env.task.scenario import Scenario
@@ -70,7 +68,7 @@ class StackSettings(NamedTuple):
 
     bodies: np.ndarray  # (field, robot, 1); one robot where all are alike
     ekf: Ekf
-    loop: WheelLoop
+    loop: WheelLoopRow
     gains: Gains
     observer_gain: float
     smoothing: float

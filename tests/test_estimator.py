@@ -19,10 +19,10 @@ from tlf_env.onboard.estimator import (
     Estimate,
     correct,
     ekf_constants,
-    odometry,
     predict,
 )
 from tlf_env.onboard.tracking import body_errors
+from tlf_env.physics.vehicle import odometry
 from tlf_env.task.observation import TRACKING_ENTRIES, Tracking
 
 PRINTED = ekf_constants(EkfParameters())

@@ -15,14 +15,13 @@ from baselines import ReferencePolicy
 from tlf_env.engine.formation import Formation
 from tlf_env.envs.single import FormationEnv
 from tlf_env.onboard.controllers import controller, controller_names
-from tlf_env.onboard.estimator import odometry
 from tlf_env.onboard.limiter import (
     TwistLimits,
     braked,
     limited_twist,
-    limits_row,
     saturated,
     speed_range,
+    twist_limits_row,
     within,
 )
 from tlf_env.onboard.tracking import (
@@ -32,6 +31,7 @@ from tlf_env.onboard.tracking import (
     gains_row,
     tracking_twist,
 )
+from tlf_env.physics.kinematics import odometry
 from tlf_env.physics.parameters import body
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import TRACKING_ENTRIES, Preview, Tracking, tracking_entries
@@ -41,9 +41,9 @@ PERIOD_S = 0.02
 PREVIEW_S = (0.5, 1.0)
 ENTRIES = len(tracking_entries(PREVIEW_S))
 SCALES = np.array([entry.scale for entry in tracking_entries(PREVIEW_S).values()])
-NONE = limits_row(TwistLimits(), PERIOD_S)
+NONE = twist_limits_row(TwistLimits(), PERIOD_S)
 TUNED = controller("tuned").limits
-ALL = limits_row(TUNED, PERIOD_S)
+ALL = twist_limits_row(TUNED, PERIOD_S)
 PAPERS = [name for name in controller_names() if name != "tuned"]
 
 speeds = st.floats(-2000, 2000)
@@ -220,7 +220,7 @@ def test_a_braked_error_falls_under_a_constant_deceleration(k_1_per_s):
 
 
 def test_limits_on_accelerations_are_per_second():
-    half = limits_row(TUNED, PERIOD_S / 2)
+    half = twist_limits_row(TUNED, PERIOD_S / 2)
     assert (2 * half.step_1, 2 * half.step_2) == (ALL.step_1, ALL.step_2)
     assert 2 * half.turning_loss == ALL.turning_loss
     assert half.lateral == ALL.lateral

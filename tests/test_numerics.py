@@ -6,6 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from tlf_env.numerics import compiled
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import driver
 from tlf_env.numerics.philox import MAX_SEED, normal_pair, unit, words
+from tlf_env.numerics.rows import replacing
 
 untimed = settings(deadline=None)  # the first call compiles
 
@@ -236,3 +238,27 @@ def test_a_read_only_package_compiles_once_and_writes_to_the_cache_only(copied_p
     finally:
         for path in (copied_package, *files):
             path.chmod(0o755)
+
+
+class Row(NamedTuple):
+    first: float
+    second: float
+    third: float
+
+
+with_third = replacing(Row, "third")
+with_outer = replacing(Row, "third", "first")
+
+
+@given(st.tuples(*(st.floats(allow_nan=False),) * 3), st.floats(allow_nan=False))
+@untimed
+def test_replacing_changes_the_named_fields_and_copies_the_others(values, new):
+    row = Row(*values)
+    assert with_third(row, new) == row._replace(third=new)
+    assert with_outer(row, new, 0.0) == row._replace(third=new, first=0.0)
+    assert with_outer.py_func(row, first=0.0, third=new) == row._replace(third=new, first=0.0)
+
+
+def test_replacing_refuses_a_name_that_is_no_field():
+    with pytest.raises(ValueError, match="Row has no field fourth"):
+        replacing(Row, "first", "fourth")

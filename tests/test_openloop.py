@@ -70,7 +70,7 @@ def test_a_file_that_is_not_json_is_refused(tmp_path, content):
 
 @pytest.mark.parametrize("data", [[], [RUN], 3, "text", None, {}])
 def test_a_file_without_named_scenarios_is_refused(tmp_path, data):
-    assert "must hold an object of named scenarios" in refused(tmp_path, data)
+    assert "must contain an object of named scenarios" in refused(tmp_path, data)
 
 
 @pytest.mark.parametrize("name", ["", ".", "..", "../up", "a/b", ".hidden"])
@@ -127,7 +127,7 @@ def test_a_start_at_its_bounds_stays_finite(names, sign):
 def test_a_key_that_stands_twice_is_refused(tmp_path, text):
     path = tmp_path / "runs.json"
     path.write_text(text)
-    assert re.search("the key '(go|duration_s)' stands there twice", complaint(path))
+    assert re.search("the key '(go|duration_s)' is repeated", complaint(path))
 
 
 @pytest.mark.parametrize("missing", ["duration_s", "inputs"])
@@ -256,7 +256,7 @@ def test_the_refusal_names_the_offset_that_fits():
 
 
 def test_loads_that_do_not_add_up_are_refused():
-    with pytest.raises(ValidationError, match="the three wheels carry 1"):
+    with pytest.raises(ValidationError, match="it must be 1"):
         RobotParameters(drive_load_share=0.45)
 
 

@@ -275,7 +275,7 @@ def test_round_lengths() -> None:
 
 
 def test_impossible_options_are_refused() -> None:
-    with pytest.raises(ValueError, match="mode 'video' is not one of rgb_array, human"):
+    with pytest.raises(ValueError, match="mode 'video' is not one of human, rgb_array"):
         make_renderer(mode="video")
     with pytest.raises(ValueError, match=r"size_px \(960, 10\) must be at least 64"):
         make_renderer(size_px=(960, 10))

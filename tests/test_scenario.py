@@ -370,7 +370,7 @@ def test_a_key_that_stands_twice_is_refused_and_named(tmp_path, place):
     load_scenario(written(tmp_path, f"{text}{key}\n"))
     message = refusal(written(tmp_path, f"{text}{key}\n{indent}{key}\n"))
     assert repr(key.split(":")[0]) in message
-    assert "twice" in message
+    assert "is repeated" in message
     assert "line 3" in message or "line 5" in message
 
 

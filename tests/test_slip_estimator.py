@@ -20,9 +20,9 @@ from tlf_env.onboard.slip_estimator import (
     SlipEkfParameters,
     SlipEstimate,
     correct_with_slip,
-    jumps,
     predict_with_slip,
     slip_ekf_constants,
+    split_change,
 )
 from tlf_env.onboard.tracking import body_errors
 from tlf_env.task.scenario import load_scenario
@@ -70,7 +70,9 @@ def predicted(
 
 def steady(*noise: float, variance: float, bounds: tuple[float, float]) -> SlipEkf:
     """A filter that learns nothing: process noise per sample, variance of a fix (mm²), bounds of slip."""
-    constants = CHOSEN._replace(variance=variance, least=0.0, bound_1=bounds[0], bound_2=bounds[1])
+    constants = CHOSEN._replace(
+        variance=variance, least_variance=0.0, bound_1=bounds[0], bound_2=bounds[1]
+    )
     return constants._replace(**dict(zip(SlipEkf._fields[:5], noise, strict=True)))
 
 
@@ -483,9 +485,9 @@ def test_quiet_motion_is_hardly_a_surprise(noise_mm):
 def test_who_stands_is_never_surprised():
     """Yaw slip does not show in the fixes of a robot at rest, so they say nothing about it."""
     e, z = packed(np.zeros(5), random_covariance(np.random.default_rng(8)))
-    z = z._replace(ahead=50.0, aside=50.0)
+    z = z._replace(mean_forward=50.0, mean_right=50.0)
     still = predicted(e, z, LEARNING, 0.0, 0.0, DT)
-    calm = predicted(e, z._replace(ahead=0.0, aside=0.0), LEARNING, 0.0, 0.0, DT)
+    calm = predicted(e, z._replace(mean_forward=0.0, mean_right=0.0), LEARNING, 0.0, 0.0, DT)
     np.testing.assert_array_equal(covariance(*still), covariance(*calm))
     moving = predicted(e, z, LEARNING, 400.0 * DT, 0.0, DT)
     assert moving[1].p_11 > still[1].p_11
@@ -501,7 +503,7 @@ MOST = 6.5e-4  # mm per sample and sample: 650 mm/s²
 @untimed
 @given(changes, changes, changes)
 def test_a_change_is_usual_or_slip_or_spin_and_nothing_gets_lost(change, beyond, spin):
-    usual, slip, spun = jumps(change, beyond, spin, MOST, 0.0, 0.0)
+    usual, slip, spun = split_change(change, beyond, spin, MOST, 0.0, 0.0)
     assert abs(usual) <= MOST
     assert usual + slip + (spun - spin) == pytest.approx(change, abs=1e-15)
     assert slip * change >= 0.0
@@ -510,24 +512,24 @@ def test_a_change_is_usual_or_slip_or_spin_and_nothing_gets_lost(change, beyond,
 @untimed
 @given(st.floats(-MOST, MOST), changes, changes)
 def test_what_the_motors_can_do_is_no_slip(change, beyond, spin):
-    assert jumps(change, beyond, spin, MOST, 0.0, 0.0) == (change, 0.0, spin)
+    assert split_change(change, beyond, spin, MOST, 0.0, 0.0) == (change, 0.0, spin)
 
 
 @untimed
 @given(changes, changes)
 def test_without_limits_on_accelerations_nothing_is_slip(change, beyond):
-    assert jumps(change, beyond, 0.0, math.inf, 0.0, MOST) == (change, 0.0, 0.0)
+    assert split_change(change, beyond, 0.0, math.inf, 0.0, MOST) == (change, 0.0, 0.0)
 
 
 @untimed
 @given(st.floats(0.01, 1.0), st.sampled_from([1.0, -1.0]))
 def test_wheels_moved_away_from_what_was_asked_tell_slip(change, way):
     """As far as they have come past it; what leads towards it is spin."""
-    _, slip, spin = jumps(way * change, way * change, 0.0, MOST, 0.0, 0.0)
+    _, slip, spin = split_change(way * change, way * change, 0.0, MOST, 0.0, 0.0)
     assert (slip, spin) == (pytest.approx(way * (change - MOST)), 0.0)
-    _, slip, spin = jumps(way * change, -way * 0.5, 0.0, MOST, 0.0, 0.0)
+    _, slip, spin = split_change(way * change, -way * 0.5, 0.0, MOST, 0.0, 0.0)
     assert (slip, spin) == (0.0, pytest.approx(way * (change - MOST)))
-    _, slip, _ = jumps(way * change, way * 0.005, 0.0, MOST, 0.0, 0.0)
+    _, slip, _ = split_change(way * change, way * 0.005, 0.0, MOST, 0.0, 0.0)
     assert slip == way * 0.005
 
 
@@ -536,7 +538,7 @@ def test_wheels_moved_away_from_what_was_asked_tell_slip(change, way):
 def test_a_wheel_that_gets_hold_again_is_no_slip(spin, share, way):
     """The way back of a spin that it had leaves slip where it was."""
     back = -way * (share * spin + MOST)
-    _, slip, left = jumps(back, back, way * spin, MOST, 0.0, 0.0)
+    _, slip, left = split_change(back, back, way * spin, MOST, 0.0, 0.0)
     assert slip == pytest.approx(0.0, abs=1e-12)
     assert left == pytest.approx(way * spin * (1.0 - share), abs=1e-12)
 
@@ -546,7 +548,7 @@ def test_a_wheel_that_gets_hold_again_is_no_slip(spin, share, way):
 def test_a_spin_ends_with_the_grip_and_not_beyond(spin):
     spins = [spin]
     for _ in range(3):
-        spins.append(jumps(0.0, 0.0, spins[-1], MOST, 0.0, 0.5)[2])
+        spins.append(split_change(0.0, 0.0, spins[-1], MOST, 0.0, 0.5)[2])
     assert np.all(np.abs(spins[1:]) == np.maximum(np.abs(spins[:-1]) - 0.5, 0.0))
     assert np.all(np.array(spins) * spin >= 0.0)
 
@@ -554,8 +556,8 @@ def test_a_spin_ends_with_the_grip_and_not_beyond(spin):
 @untimed
 @given(changes, changes, changes)
 def test_left_and_right_are_alike(change, beyond, spin):
-    there = jumps(change, beyond, spin, MOST, 1e-8, 2e-4)
-    back = jumps(-change, -beyond, -spin, MOST, 1e-8, 2e-4)
+    there = split_change(change, beyond, spin, MOST, 1e-8, 2e-4)
+    back = split_change(-change, -beyond, -spin, MOST, 1e-8, 2e-4)
     assert tuple(-one for one in back) == there
 
 
@@ -635,8 +637,8 @@ def test_rough_encoders_tell_no_false_slip(encoder, bound):
 def test_without_the_learned_roughness_rough_encoders_would_tell_false_slip():
     """So the test above can fail."""
     change = np.random.default_rng(9).normal(0.0, 0.14, 2000)  # mm: 2 mrad of noise in two readings
-    calm = [abs(jumps(c, c, 0.0, MOST, 0.14**2, 0.0)[1]) for c in change]
-    wild = [abs(jumps(c, c, 0.0, MOST, 0.0, 0.0)[1]) for c in change]
+    calm = [abs(split_change(c, c, 0.0, MOST, 0.14**2, 0.0)[1]) for c in change]
+    wild = [abs(split_change(c, c, 0.0, MOST, 0.0, 0.0)[1]) for c in change]
     assert np.mean(calm) < 1e-3 * np.mean(wild)
 
 

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from baselines import ReferencePolicy
 from tlf_env.engine.batch import BatchPlant
 from tlf_env.engine.formation import Formation
-from tlf_env.onboard.spacing import Heard, Spacing, approach_speed, spaced_twist, spacing_row
+from tlf_env.onboard.spacing import Predecessor, Spacing, approach_speed, spaced_twist, spacing_row
 from tlf_env.task.observation import TRACKING_ENTRIES, Tracking
 from tlf_env.task.scenario import load_scenario
 
@@ -28,11 +28,11 @@ turns = st.floats(-math.pi, math.pi)
 twists = st.tuples(st.floats(-1000, 1000), st.floats(-8, 8))
 
 
-def heard(forward: float, right: float, turn: float, twist: tuple[float, float]) -> Heard:
-    return Heard(forward, right, math.sin(turn), math.cos(turn), *twist)
+def heard(forward: float, right: float, turn: float, twist: tuple[float, float]) -> Predecessor:
+    return Predecessor(forward, right, math.sin(turn), math.cos(turn), *twist)
 
 
-def centres(h: Heard) -> np.ndarray:
+def centres(h: Predecessor) -> np.ndarray:
     """From the robot's outline centre to the predecessor's, forward and right, mm."""
     return np.array(
         [h.forward - BEHIND_MM * h.cos_turn + BEHIND_MM, h.right + BEHIND_MM * h.sin_turn]
@@ -44,7 +44,7 @@ def centre_speed(u: tuple[float, float]) -> np.ndarray:
     return np.array([u[0], BEHIND_MM * u[1]])
 
 
-def approach(u: tuple[float, float], h: Heard) -> tuple[float, float, float]:
+def approach(u: tuple[float, float], h: Predecessor) -> tuple[float, float, float]:
     """Distance of the centres (mm), own speed towards the other one and its speed away (mm/s)."""
     between = centres(h)
     distance = float(np.hypot(*between))
@@ -96,7 +96,7 @@ def test_who_brakes_as_told_stops_in_time_behind_one_that_brakes(room, leaving):
 
 
 def test_a_robot_at_the_same_place_is_left_alone():
-    h = Heard(0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
+    h = Predecessor(0.0, 0.0, 0.0, 1.0, 0.0, 0.0)
     assert spaced_twist(100.0, 1.0, h, ROW) == (100.0, 1.0)
 
 
@@ -172,7 +172,7 @@ def test_behind_a_robot_that_does_not_move_the_distance_is_kept(plant):
 
 def test_one_gap_behind_on_the_slowest_preset_nothing_is_held_back():
     """300 mm apart at 60 mm/s, as the flower starts."""
-    h = Heard(300.0, 0.0, 0.0, 1.0, 60.0, 0.0)
+    h = Predecessor(300.0, 0.0, 0.0, 1.0, 60.0, 0.0)
     assert spaced_twist(60.0, 0.1, h, ROW) == (60.0, 0.1)
 
 

@@ -396,7 +396,7 @@ def test_bad_input_is_one_line_and_writes_nothing(change, said, tmp_path, monkey
     [
         ("no_such", "'no_such' is not one of tuned, nor a .yaml file"),
         ("no_such.yaml", "cannot read no_such.yaml"),
-        ("list.yaml", "must hold a mapping"),
+        ("list.yaml", "must contain a mapping"),
         ("search.yaml --trials 0", "trials: Input should be greater than or equal to 1, got 0"),
         ("search.yaml --workers -1", "workers -1 must be at least 1"),
     ],

@@ -14,8 +14,8 @@ from scipy import signal
 
 import tlf_env
 from tlf_env.onboard.wheel_loop import (
-    WheelLoop,
     WheelLoopParameters,
+    WheelLoopRow,
     digital_wheel_loop,
     wheel_torque,
 )
@@ -34,7 +34,7 @@ def eq_13(s):
     return 150 * (s**2 + 3 * s + 0.3025) / (s * (s + 2))
 
 
-def feed(loop: WheelLoop, errors: np.ndarray, limit: float = math.inf) -> np.ndarray:
+def feed(loop: WheelLoopRow, errors: np.ndarray, limit: float = math.inf) -> np.ndarray:
     """Torques (N·mm) that the law gives for a sequence of speed errors."""
     integral = lag = 0.0
     torques = np.empty(len(errors))
@@ -43,7 +43,7 @@ def feed(loop: WheelLoop, errors: np.ndarray, limit: float = math.inf) -> np.nda
     return torques / TO_LAW
 
 
-def decaying_response(loop: WheelLoop, period_s: float) -> np.ndarray:
+def decaying_response(loop: WheelLoopRow, period_s: float) -> np.ndarray:
     """First difference of the law's impulse response: it ends, within 20 time constants of the lag.
 
     The impulse response itself does not, for the integrator.
@@ -53,7 +53,7 @@ def decaying_response(loop: WheelLoop, period_s: float) -> np.ndarray:
     return np.diff(feed(loop, impulse), prepend=0.0)
 
 
-def measured_response(loop: WheelLoop, period_s: float, omega: np.ndarray) -> np.ndarray:
+def measured_response(loop: WheelLoopRow, period_s: float, omega: np.ndarray) -> np.ndarray:
     """Frequency response of the law, N·mm per rad/s."""
     _, transform = signal.freqz(decaying_response(loop, period_s), worN=omega * period_s)
     return transform / (1 - np.exp(-1j * omega * period_s))

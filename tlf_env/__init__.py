@@ -1,4 +1,4 @@
-"""Time-gap leader-follower control of wheeled robots that slip, as a multi-agent environment.
+"""Multi-agent environment of time-gap leader-follower control of wheeled robots with slip.
 
 >>> import tlf_env
 >>> env = tlf_env.parallel_env("infinity")
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 __version__ = "0.1.0"
 __all__ = ["BatchPlant", "Scenario", "__version__", "aec_env", "load_scenario", "parallel_env"]
 
-_PLACES = {
+_MODULES = {
     "BatchPlant": "tlf_env.engine.batch",
     "aec_env": "tlf_env.envs.parallel",
     "parallel_env": "tlf_env.envs.parallel",
@@ -30,11 +30,11 @@ _PLACES = {
 
 
 def __getattr__(name: str) -> Any:
-    if name not in _PLACES:
+    if name not in _MODULES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     import importlib
 
-    return getattr(importlib.import_module(_PLACES[name]), name)
+    return getattr(importlib.import_module(_MODULES[name]), name)
 
 
 for _task in ("infinity", "flower"):

@@ -19,7 +19,7 @@ from matplotlib.transforms import Affine2D
 
 from tlf_env.common.files import atomic
 from tlf_env.onboard.wheel_loop import WheelLoopParameters, digital_wheel_loop
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 
 FOLDER = Path(__file__).resolve().parent
 STYLE = {

@@ -1,1 +1,1 @@
-"""What every room shares and nothing compiled depends on: frozen models, presets, files, errors."""
+"""Shared code without compiled laws: frozen models, presets, files, error messages."""

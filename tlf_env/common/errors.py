@@ -1,4 +1,4 @@
-"""Errors for people: one line that names the value and what is allowed."""
+"""Validation errors as one line that names the value and what is allowed."""
 
 from __future__ import annotations
 
@@ -7,34 +7,38 @@ from typing import Any
 
 from pydantic import ValidationError
 
-# Parts of a place that name a branch of a union, not a key of the user's.
+# Parts of a location that name a branch of a union and are not keys of the user's data.
 BRANCH = re.compile(r"[A-Z]\w*|(literal|constrained|tuple|function)[-\[].*|int|str")
-COUNTED = ("too_short", "too_long")
-WANTED = "Input should be "
+LENGTH_ERRORS = ("too_short", "too_long")
+ALLOWED = "Input should be "
+
+
+class RepeatedKeyError(ValueError):
+    """A mapping in a YAML or JSON file has the same key twice."""
 
 
 def one_line(error: ValidationError) -> str:
-    """A validation error as one line: every place, what is wrong there, and the value."""
-    told: dict[tuple[tuple[str, ...], str], Any] = {}
+    """A validation error as one line: each location, what is wrong there, and the value."""
+    merged: dict[tuple[tuple[str, ...], str], Any] = {}
     for number, item in enumerate(_relevant(error.errors())):
-        if not item["msg"].startswith(WANTED):
-            told[(str(number),), ""] = item
+        if not item["msg"].startswith(ALLOWED):
+            merged[(str(number),), ""] = item
             continue
-        same = (_place(item), repr(item["input"]))
-        if same in told and told[same]["msg"] != item["msg"]:  # another branch of the same union
-            other = item["msg"].removeprefix(WANTED)
-            told[same] = {**told[same], "msg": f"{told[same]['msg']}, or {other}"}
+        same = (_location(item), repr(item["input"]))
+        if same in merged and merged[same]["msg"] != item["msg"]:  # another branch of the union
+            other = item["msg"].removeprefix(ALLOWED)
+            merged[same] = {**merged[same], "msg": f"{merged[same]['msg']}, or {other}"}
         else:
-            told[same] = item
-    return "; ".join(dict.fromkeys(_told(item) for item in told.values()))
+            merged[same] = item
+    return "; ".join(dict.fromkeys(_message(item) for item in merged.values()))
 
 
-def _place(item: Any) -> tuple[str, ...]:
+def _location(item: Any) -> tuple[str, ...]:
     return tuple(str(part) for part in item["loc"] if not BRANCH.fullmatch(str(part)))
 
 
 def _relevant(items: list[Any]) -> list[Any]:
-    """Where a union refused a value, only the branch that the value was meant for."""
+    """The errors without those of union branches that the value was not meant for."""
     kept = []
     for item in items:
         wrong_kind = item["type"].endswith("_type")
@@ -54,19 +58,19 @@ def _relevant(items: list[Any]) -> list[Any]:
 
 
 def _miscounted(item: Any, items: list[Any]) -> bool:
-    """Whether a sequence was counted without the members that are themselves wrong."""
+    """Whether a length error only reports that members of the sequence are invalid."""
     depth = len(item["loc"])
-    return item["type"] in COUNTED and any(
+    return item["type"] in LENGTH_ERRORS and any(
         len(other["loc"]) > depth and other["loc"][:depth] == item["loc"] for other in items
     )
 
 
-def _told(item: Any) -> str:
-    place = ".".join(_place(item))
+def _message(item: Any) -> str:
+    location = ".".join(_location(item))
     message = item["msg"].removeprefix("Value error, ")
     value = item["input"]
     if item["type"] == "extra_forbidden":
         message = "unknown key"
     elif item["type"] != "value_error" and not isinstance(value, dict | list):
         message += f", got {value!r}"
-    return f"{place}: {message}" if place else message
+    return f"{location}: {message}" if location else message

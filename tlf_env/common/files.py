@@ -1,18 +1,21 @@
-"""Files that are whole or not there."""
+"""Files that are written completely or not at all."""
 
 from __future__ import annotations
 
 import os
+import re
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
+FILE_NAME = re.compile(r"\w[\w.+-]{0,99}")  # a name that can be a file's or a folder's
+
 
 @contextmanager
 def atomic(path: Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
-    """Open a file that appears under its name only once it is whole."""
+    """Open a file for writing; it appears under its name only when it is complete."""
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:

@@ -1,4 +1,4 @@
-"""Presets and files: where they lie, and how YAML is read."""
+"""Presets (YAML files shipped in ``configs/``): where they are, and how YAML is read."""
 
 from __future__ import annotations
 
@@ -6,6 +6,8 @@ from pathlib import Path
 from typing import Any
 
 import yaml
+
+from tlf_env.common.errors import RepeatedKeyError
 
 PACKAGE = Path(__file__).resolve().parent.parent
 KINDS = {
@@ -15,28 +17,22 @@ KINDS = {
     "plan": "plans",
     "training": "train",
     "search": "tune",
-}  # what a preset can be, and its folder inside the presets' folder
+}  # kinds of preset, and the subfolder of each
 SUFFIXES = (".yaml", ".yml")
 
 
-class _RepeatedKeyError(ValueError):
-    """A YAML mapping has a key twice."""
-
-
 class _Loader(yaml.SafeLoader):
-    """YAML's safe loader, which would keep the last of two equal keys in silence, but for that."""
+    """YAML's safe loader, with an error for a repeated key instead of keeping the last one."""
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
-        """The mapping as written: what it merges with ``<<`` it may override."""
+        """The mapping as written; keys that it merges with ``<<`` may be overridden."""
         node = super().compose_mapping_node(anchor)
         seen = set()
         for key, _ in node.value:
             if isinstance(key, yaml.ScalarNode) and key.value != "<<":
                 if key.value in seen:
                     line = key.start_mark.line + 1
-                    raise _RepeatedKeyError(
-                        f"line {line}: the key {key.value!r} stands there twice"
-                    )
+                    raise RepeatedKeyError(f"line {line}: the key {key.value!r} is repeated")
                 seen.add(key.value)
         return node
 
@@ -47,18 +43,18 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        in one line, if the file is missing, is not YAML, is not a mapping, or has a key twice.
+        in one line, if the file is missing, is not YAML, is not a mapping, or repeats a key.
     """
     try:
         data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
-    except _RepeatedKeyError as error:
+    except RepeatedKeyError as error:
         raise ValueError(f"{path}, {error}") from error
     except (yaml.YAMLError, UnicodeDecodeError) as error:
         raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
-        raise ValueError(f"{path} must hold a mapping, got {type(data).__name__}")
+        raise ValueError(f"{path} must contain a mapping, got {type(data).__name__}")
     return data
 
 
@@ -70,7 +66,7 @@ def presets_folder(kind: str = "scenario") -> Path:
 
 
 def preset_names(kind: str = "scenario") -> list[str]:
-    """Names of the presets of a kind, sorted."""
+    """Sorted names of the presets of a kind."""
     return sorted(path.stem for path in presets_folder(kind).glob("*.yaml"))
 
 
@@ -89,12 +85,12 @@ def read_preset_or_file(kind: str, source: str | Path, others: str = "") -> dict
     source
         A preset's name, or a path that ends in ``.yaml`` or ``.yml``.
     others
-        What else is allowed, for the error.
+        What else is allowed, appended to the error message.
 
     Raises
     ------
     ValueError
-        in one line, for a source that is neither, and as :func:`read_yaml` does.
+        in one line, if the source is neither, or as :func:`read_yaml`.
     """
     names = preset_names(kind)
     if str(source) in names:

@@ -16,8 +16,7 @@ from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.disturbances.channels import CHANNELS, PATHS, SUBSTEP, number, numbers
 from tlf_env.disturbances.signals import Constant, Signal
 from tlf_env.numerics.compiled import law
-from tlf_env.physics.parameters import Body
-from tlf_env.physics.state import Motion
+from tlf_env.physics.vehicle import Body, Motion
 
 
 def _plain_number(value: Any) -> Any:

@@ -25,7 +25,7 @@ from tlf_env.onboard.estimator import ekf_constants
 from tlf_env.onboard.observer import Message, Reference
 from tlf_env.onboard.slip_estimator import slip_ekf_constants
 from tlf_env.onboard.wheel_loop import WheelLoopParameters, digital_wheel_loop
-from tlf_env.physics.parameters import body
+from tlf_env.physics.vehicle import body
 from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
 from tlf_env.task.info import Info
 from tlf_env.task.measures import TIME_GAP_WINDOW_S

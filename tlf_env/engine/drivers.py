@@ -37,7 +37,7 @@ from tlf_env.engine.starting import STARTED, clear, start_lane
 from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import block, driver, fetch_add, law
 from tlf_env.onboard.observer import Message
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 from tlf_env.task.actions import (
     FULL_RESIDUAL_MM_S,
     FULL_RESIDUAL_RAD_S,
@@ -46,7 +46,7 @@ from tlf_env.task.actions import (
     RESIDUAL,
     TORQUE,
     TWIST,
-    limited,
+    clipped_action,
     reference_action,
     residual_share,
     twist_action,
@@ -106,7 +106,10 @@ def take_actions(arrays: Arrays, lane: int, settings: Settings) -> None:
                 arrays.observations[lane, robot], arrays.scales, settings.base
             )
             arrays.actions[lane, robot, 0], arrays.actions[lane, robot, 1] = given[0], given[1]
-        a_0, a_1 = limited(arrays.actions[lane, robot, 0]), limited(arrays.actions[lane, robot, 1])
+        a_0, a_1 = (
+            clipped_action(arrays.actions[lane, robot, 0]),
+            clipped_action(arrays.actions[lane, robot, 1]),
+        )
         clipped = a_0 != arrays.actions[lane, robot, 0] or a_1 != arrays.actions[lane, robot, 1]
         if clipped:
             arrays.infos[lane, robot, CLIPPED] += 1.0

@@ -25,8 +25,8 @@ from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.parts import Factory
-from tlf_env.physics.parameters import Body
 from tlf_env.physics.pymunk_plant import PymunkPlant
+from tlf_env.physics.vehicle import Body
 from tlf_env.task.info import Info
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.trajectories import sample

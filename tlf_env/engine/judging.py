@@ -21,11 +21,10 @@ from tlf_env.engine.radio import delayed_message, latest_message, read_reference
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
-from tlf_env.onboard.estimator import odometry
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.tracking import body_errors
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
-from tlf_env.physics.state import axle_midpoint
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.vehicle import axle_midpoint, odometry
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.info import HORIZON, LOST, OTHER_ROBOT, RUNNING, TOUCHED, Info
 from tlf_env.task.measures import distance, time_gap_error

@@ -19,9 +19,8 @@ from tlf_env.disturbances.channels import Effects
 from tlf_env.numerics.compiled import reader, row_reader, row_writer, writer
 from tlf_env.onboard.estimator import Ekf, Estimate
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
-from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState
-from tlf_env.physics.parameters import Body
-from tlf_env.physics.state import Contact, Motion
+from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState
+from tlf_env.physics.vehicle import Body, Contact, Motion
 
 
 class Sensors(NamedTuple):
@@ -147,7 +146,7 @@ class Row(NamedTuple):
 
 ROWS = (
     Row("body", Body, Kind.CONSTANT),
-    Row("wheel_loop", WheelLoop, Kind.CONSTANT),
+    Row("wheel_loop", WheelLoopRow, Kind.CONSTANT),
     Row("ekf", Ekf, Kind.CONSTANT),
     Row("slip_ekf", SlipEkf, Kind.CONSTANT),
     Row("motion", Motion, Kind.STATE),

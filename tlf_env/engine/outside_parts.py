@@ -12,7 +12,7 @@ from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.layout import Sample
 from tlf_env.engine.settings import Settings
 from tlf_env.onboard.parts import Factory, finite, load_part, make_part
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.scenario import Scenario
 

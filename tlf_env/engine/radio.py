@@ -14,9 +14,10 @@ from tlf_env.engine.arrays import (
     write_observer,
 )
 from tlf_env.engine.layout import Pose
-from tlf_env.engine.settings import TRUTH, Settings
+from tlf_env.engine.settings import Settings
 from tlf_env.numerics.compiled import law, slot_reader, slot_writer
 from tlf_env.numerics.philox import unit, words
+from tlf_env.onboard.kinds import TRUTH
 from tlf_env.onboard.observer import (
     Message,
     Reference,
@@ -25,7 +26,7 @@ from tlf_env.onboard.observer import (
     observer_rates,
     smoothing,
 )
-from tlf_env.physics.state import forward_and_yaw
+from tlf_env.physics.vehicle import forward_and_yaw
 
 read_message = slot_reader(Message)
 write_message = slot_writer(Message)

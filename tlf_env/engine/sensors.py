@@ -20,12 +20,12 @@ from tlf_env.engine.layout import (
     Trace,
     in_tile,
 )
-from tlf_env.engine.settings import EKF, EKF_SLIP, TRUTH
 from tlf_env.engine.substeps import EXTERNAL_TORQUE, wanted
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.philox import normal_pair
 from tlf_env.numerics.rows import replacing
-from tlf_env.onboard.estimator import Ekf, Estimate, correct, odometry, predict
+from tlf_env.onboard.estimator import Ekf, Estimate, correct, predict
+from tlf_env.onboard.kinds import EKF, EKF_SLIP, TRUTH
 from tlf_env.onboard.slip_estimator import (
     SlipEkf,
     SlipEstimate,
@@ -33,8 +33,7 @@ from tlf_env.onboard.slip_estimator import (
     predict_with_slip,
 )
 from tlf_env.onboard.tracking import body_errors
-from tlf_env.physics.parameters import Body
-from tlf_env.physics.state import Motion, axle_midpoint, forward_and_yaw
+from tlf_env.physics.vehicle import Body, Motion, axle_midpoint, forward_and_yaw, odometry
 from tlf_env.task.actions import TORQUE
 
 # Encoders are exact while all of their channels are at their nominal values.

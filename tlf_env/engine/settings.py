@@ -7,12 +7,11 @@ from typing import NamedTuple
 
 from tlf_env.disturbances.model import changes_within_episode
 from tlf_env.onboard.controllers import controller
+from tlf_env.onboard.kinds import ESTIMATOR_CODES, EXTERNAL
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.tracking import ControllerRow, controller_row
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.scenario import Scenario
-
-EKF, TRUTH, EXTERNAL, EKF_SLIP = range(4)
 
 
 class Settings(NamedTuple):
@@ -49,7 +48,6 @@ def make_settings(scenario: Scenario) -> Settings:
     """The scenario's numbers as the drivers take them."""
     observer = scenario.observer
     paper = observer if isinstance(observer, ObserverParameters) else ObserverParameters()
-    kinds = {"ekf": EKF, "ekf-slip": EKF_SLIP, "truth": TRUTH}
     return Settings(
         kinematic=scenario.plant == "kinematic",
         collides=scenario.plant == "pymunk",
@@ -66,7 +64,7 @@ def make_settings(scenario: Scenario) -> Settings:
         lost_beyond=scenario.lost_beyond_mm,
         end_on_lost="lost" in scenario.end_on,
         end_on_touched="touched" in scenario.end_on,
-        estimator=kinds.get(scenario.estimator, EXTERNAL),
+        estimator=ESTIMATOR_CODES.get(scenario.estimator, EXTERNAL),
         has_parts=bool(scenario.part_paths),
         external_wheel_loop=isinstance(scenario.wheel_loop, str),
         external_observer=isinstance(observer, str),

@@ -37,8 +37,7 @@ from tlf_env.numerics.compiled import block, law, writer
 from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.numerics.rows import replacing
 from tlf_env.onboard.estimator import Estimate
-from tlf_env.physics.parameters import Mass, laden
-from tlf_env.physics.state import Motion
+from tlf_env.physics.vehicle import Mass, Motion, laden
 from tlf_env.task.measures import distance
 from tlf_env.task.scenario import START_MARGIN_MM
 

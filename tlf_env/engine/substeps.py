@@ -10,9 +10,8 @@ from tlf_env.disturbances.channels import Effects
 from tlf_env.engine.layout import Order, Sensors, Trace, Traction
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.rows import replacing
-from tlf_env.onboard.wheel_loop import WheelLoop, WheelLoopState, wheel_torque
-from tlf_env.physics.parameters import Body
-from tlf_env.physics.state import Contact, Floor, Motion, conveyor
+from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState, wheel_torque
+from tlf_env.physics.vehicle import Body, Contact, Floor, Motion, conveyor
 from tlf_env.task.actions import TORQUE
 
 EXTERNAL_TORQUE = (
@@ -38,7 +37,12 @@ def wanted(order: Order, substep: int) -> tuple[float, float]:
 
 @law
 def asked_torques(
-    body: Body, loop: WheelLoop, order: Order, held: WheelLoopState, sensors: Sensors, substep: int
+    body: Body,
+    loop: WheelLoopRow,
+    order: Order,
+    held: WheelLoopState,
+    sensors: Sensors,
+    substep: int,
 ) -> tuple[float, float, WheelLoopState]:
     """Commanded torques in a substep, within the motors' limit, and the wheel loops' new state."""
     limit = body.torque_limit

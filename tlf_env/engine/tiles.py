@@ -51,9 +51,7 @@ from tlf_env.engine.substeps import (
     with_grip,
 )
 from tlf_env.numerics.compiled import allocating, block, law, view
-from tlf_env.physics.kernel import roll, slide
-from tlf_env.physics.kinematics import follow_wheels
-from tlf_env.physics.state import Push, advance_pose
+from tlf_env.physics.vehicle import Push, advance_pose, follow_wheels, roll, slide
 from tlf_env.task.actions import TORQUE
 
 WIDTH = 8  # robots in a tile: doubles in the widest vectors there are

@@ -23,6 +23,7 @@ from tlf_env.engine.judging import terminated, truncated
 from tlf_env.envs.spec import documented
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import Factory, part_name, real_numbers
+from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.info import END_REASONS, Info, State
 from tlf_env.task.observation import OBSERVATION_LIMIT
@@ -31,8 +32,7 @@ from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
 
 Agent = str
 Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
-RENDER_MODES = ["human", "rgb_array"]
-FARTHEST_START_MM = 1e9
+START_POSE_LIMIT_MM = 1e9
 PETTINGZOO_TEST_OPTION = "options"  # what PettingZoo's own API test passes; means nothing
 
 
@@ -101,7 +101,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             warnings.warn(line, ReferenceWarning, stacklevel=callers_level())
         self.metadata: dict[str, Any] = {
             "name": f"tlf_env/{self.scenario.name}-v0",
-            "render_modes": RENDER_MODES,
+            "render_modes": list(RENDER_MODES),
             "is_parallelizable": True,
             "render_fps": 1 / self.scenario.control_period_s,
         }
@@ -385,10 +385,10 @@ def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | No
     except (TypeError, ValueError) as error:
         told = " ".join(f"{error}, got {options['poses']!r}".split())
         raise ValueError(f"reset option poses must be numbers: {told}") from error
-    if poses.shape != (robots, 3) or not (np.abs(poses) <= FARTHEST_START_MM).all():
+    if poses.shape != (robots, 3) or not (np.abs(poses) <= START_POSE_LIMIT_MM).all():
         raise ValueError(
             f"reset option poses must be {robots} finite rows (x mm, y mm, θ rad) "
-            f"within ±{FARTHEST_START_MM:g}, "
+            f"within ±{START_POSE_LIMIT_MM:g}, "
             f"got the shape {poses.shape}: {' '.join(repr(options['poses']).split())}"
         )
     return poses, float(phase_s)

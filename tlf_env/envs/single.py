@@ -9,9 +9,10 @@ from typing import Any, cast
 import gymnasium
 import numpy as np
 
-from tlf_env.envs.parallel import RENDER_MODES, FormationParallelEnv
+from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.envs.spec import documented
 from tlf_env.onboard.parts import Policy, load_part, make_part, predicted
+from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE, TWIST
 from tlf_env.task.scenario import Scenario
 
@@ -50,7 +51,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         for an unknown learner, key or value, in one line.
     """
 
-    metadata: dict[str, Any] = {"render_modes": RENDER_MODES, "render_fps": 50}
+    metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 50}
 
     def __init__(
         self,

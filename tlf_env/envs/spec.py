@@ -10,7 +10,7 @@ from collections.abc import Sequence
 from typing import TypeVar
 
 from tlf_env.task.actions import ACTION_ENTRIES
-from tlf_env.task.feasibility import FARTHEST_FIX_MM, FARTHEST_START_MM, LONGEST_S
+from tlf_env.task.feasibility import SENSOR_FIX_LIMIT_MM, SENSOR_START_LIMIT_MM, SENSOR_TIME_LIMIT_S
 from tlf_env.task.info import INFO_MEANINGS, OTHER_INFO
 from tlf_env.task.observation import (
     OBSERVATION_LIMIT,
@@ -72,10 +72,11 @@ def observation_section() -> str:
                 ("entry", "meaning", "unit", "scale"),
                 [row[1:] for row in entry_rows(SENSOR_TAIL_ENTRIES)],
             ),
-            f"Clipping limits the range of `sensor`: fixes and messages to ±{FARTHEST_FIX_MM / 1e3:g} m "
-            f"from the robot's own start,\nthe start itself to ±{FARTHEST_START_MM / 1e3:g} m in the "
-            f"world, per coordinate, and `time` to {LONGEST_S:g} s. Beyond these limits\nan entry stays "
-            "constant. A scenario that exceeds them within its horizon gives a `ReferenceWarning`\n"
+            f"Clipping limits the range of `sensor`: fixes and messages to ±{SENSOR_FIX_LIMIT_MM / 1e3:g} m "
+            f"from the robot's own start,\nthe start itself to ±{SENSOR_START_LIMIT_MM / 1e3:g} m in the "
+            f"world, per coordinate, and `time` to {SENSOR_TIME_LIMIT_S:g} s. Beyond these limits\n"
+            "an entry stays constant. A scenario that exceeds them within its horizon gives a "
+            "`ReferenceWarning`\n"
             "(`tlf run` prints it) with the place and the limit; scatter of the starts and the options "
             "`poses` and\n`phase_s` of a reset are not checked.",
         ]

@@ -1,1 +1,1 @@
-"""What every other room may use: compilation, random numbers, angles. Knows nothing of robots."""
+"""Compilation, random numbers and angles; nothing here depends on robots."""

@@ -1,4 +1,4 @@
-"""Angles that do not jump."""
+"""Wrapping of angles."""
 
 from __future__ import annotations
 
@@ -13,5 +13,5 @@ TURN = 2.0 * math.pi
 
 @law
 def wrap(angle: float) -> float:
-    """The same direction within [−π, π], rad."""
+    """The angle wrapped to [−π, π], rad."""
     return angle - TURN * np.rint(angle / TURN)

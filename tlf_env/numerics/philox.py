@@ -1,8 +1,8 @@
-"""Random numbers without stored state: Philox 4×64 with ten rounds, keyed by who asks and indexed by when.
+"""Random numbers without stored state: Philox 4×64 with ten rounds.
 
-A draw is a function of (seed, channel, robot, episode, index) and of nothing else. So the order of
-robots, the size of a batch, a partial reset or a snapshot cannot change a draw, and no channel of
-noise can move another's. Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
+A draw is a function of (seed, channel, robot, episode, index) alone. The order of the robots, the size
+of a batch, a partial reset or a snapshot cannot change a draw, and no channel shifts another's draws.
+Salmon et al., "Parallel random numbers: as easy as 1, 2, 3", SC 2011.
 """
 
 from __future__ import annotations
@@ -34,8 +34,8 @@ Words = tuple[np.uint64, np.uint64, np.uint64, np.uint64]
 def high_product(a: np.uint64, b: np.uint64) -> np.uint64:
     """Upper 64 bits of the product of two unsigned 64-bit integers.
 
-    The two middle products are added as twice their mean, which cannot overflow. A usual sum with its
-    carries would be recognised by the compiler as one 128-bit product, which vectors do not have.
+    The two middle products are added as twice their mean, which cannot overflow. The compiler would
+    recognise the usual sum with carries as one 128-bit product, which has no vector instruction.
     """
     a_low, a_high = a & LOW_32, a >> SHIFT_32
     b_low, b_high = b & LOW_32, b >> SHIFT_32
@@ -49,7 +49,7 @@ def high_product(a: np.uint64, b: np.uint64) -> np.uint64:
 def two_rounds(
     c_0: np.uint64, c_1: np.uint64, c_2: np.uint64, c_3: np.uint64, k_0: np.uint64, k_1: np.uint64
 ) -> Words:
-    """Two of Philox's rounds; the second with the next keys."""
+    """Two Philox rounds; the second uses the next keys."""
     high_0, low_0 = high_product(MULTIPLIER_0, c_0), MULTIPLIER_0 * c_0
     high_1, low_1 = high_product(MULTIPLIER_1, c_2), MULTIPLIER_1 * c_2
     c_0, c_1, c_2, c_3 = high_1 ^ c_1 ^ k_0, low_1, high_0 ^ c_3 ^ k_1, low_0
@@ -64,7 +64,7 @@ def philox(
 ) -> Words:
     """Four random words for a counter of four words and a key of two; all ``uint64``.
 
-    The ten rounds are written out: a loop inside would keep lanes from running together.
+    The ten rounds are written out: an inner loop would prevent vectorisation over robots.
     """
     c_0, c_1, c_2, c_3 = two_rounds(c_0, c_1, c_2, c_3, k_0, k_1)
     c_0, c_1, c_2, c_3 = two_rounds(c_0, c_1, c_2, c_3, k_0 + WEYL_0 * TWO, k_1 + WEYL_1 * TWO)
@@ -75,7 +75,7 @@ def philox(
 
 @law
 def words(seed: int, channel: int, robot: int, episode: int, index: int) -> Words:
-    """The four words of one draw; all arguments are whole numbers from 0 on."""
+    """The four words of one draw; all arguments are non-negative whole numbers."""
     key = (np.uint64(channel) << SHIFT_32) | np.uint64(robot)
     return philox(np.uint64(index), np.uint64(episode), ZERO, ZERO, np.uint64(seed), key)
 
@@ -103,7 +103,7 @@ def checked_seed(seed: int) -> int:
     Raises
     ------
     ValueError
-        if it is no whole number from 0 to 2⁶³ − 1.
+        if it is not a whole number from 0 to 2⁶³ − 1.
     """
     if (
         isinstance(seed, bool)

@@ -1,4 +1,4 @@
-"""Compiled access to large named tuples."""
+"""Compiled helpers for rows: named tuples of numbers."""
 
 from __future__ import annotations
 
@@ -9,24 +9,22 @@ from tlf_env.numerics.compiled import law
 
 
 def replacing(row: type[Any], *names: str) -> Callable[..., Any]:
-    """Compiled ``replace(row, *values)``: the named tuple with the fields ``names`` replaced, in order.
+    """Compiled ``replace(old, name=value, ...)``: a copy of a row with new values in these fields.
 
-    All other fields are copied, so that a law that changes a few fields need not list the others. Numba
-    has no ``_replace``.
+    The other fields are copied, so that a field added to the row needs no edit where it does not
+    change.
 
     Raises
     ------
     ValueError
-        for a name that is not a field.
+        for a name that is not a field of the row.
     """
-    unknown = [name for name in names if name not in row._fields]
+    unknown = set(names) - set(row._fields)
     if unknown:
-        raise ValueError(f"{row.__name__} has no field {unknown[0]!r}; it has {row._fields}")
+        raise ValueError(f"{row.__name__} has no field {', '.join(sorted(unknown))}")
     fields = ", ".join(
-        f"{name}=v{names.index(name)}" if name in names else f"{name}=row.{name}"
-        for name in row._fields
+        f"{name}={name}" if name in names else f"{name}=_old.{name}" for name in row._fields
     )
-    values = ", ".join(f"v{i}" for i in range(len(names)))
-    scope: dict[str, Any] = {"Row": row}
-    exec(f"def replace(row, {values}):\n    return Row({fields})\n", scope)
+    scope: dict[str, Any] = {"_Row": row}
+    exec(f"def replace(_old, {', '.join(names)}):\n    return _Row({fields})\n", scope)
     return law(scope["replace"])

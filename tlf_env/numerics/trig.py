@@ -1,10 +1,10 @@
-"""Sine, cosine and logarithm in plain arithmetic, for laws that run over many lanes at once.
+"""Sine, cosine and logarithm in plain arithmetic, for laws that run over many robots at once.
 
-A compiler cannot put a call of the C library into a vector loop, and a vector library may round
-differently from the scalar one. These functions are nothing but additions, multiplications, one division
-and selections: a vector of lanes and a single lane give the same bits, on every machine. The polynomials
-are those of Sun's fdlibm (``k_sin.c``, ``k_cos.c``, ``e_log.c``); errors stay below one unit in the last
-place (``tests/test_trig.py``).
+A compiler cannot vectorise a loop that calls the C library, and a vector library may round differently
+from the scalar one. These functions use only additions, multiplications, one division and selections:
+vector and scalar code give the same bits on every machine. The polynomials are those of Sun's fdlibm
+(``k_sin.c``, ``k_cos.c``, ``e_log.c``); errors stay below one unit in the last place
+(``tests/test_trig.py``).
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HALF_PI_1 = float.fromhex("0x1.921fb544p+0")
 HALF_PI_2 = float.fromhex("0x1.0b4611a6p-34")
 HALF_PI_3 = float.fromhex("0x1.3198a2e037073p-69")
 PER_HALF_PI = 2.0 / math.pi
-LARGEST_ANGLE_RAD = 1.6e6  # up to here sine and cosine are good to one unit in the last place
+LARGEST_ANGLE_RAD = 1.6e6  # up to this angle errors stay below one unit in the last place
 
 S_1, S_2, S_3 = -1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04
 S_4, S_5, S_6 = 2.75573137070700676789e-06, -2.50507602534068634195e-08, 1.58969099521155010221e-10
@@ -65,8 +65,8 @@ def float_of(_context: Any, _bits: Any) -> Any:
 def sincos(angle: float) -> tuple[float, float]:
     """Sine and cosine of an angle in rad; NaN for NaN and infinity.
 
-    The angle less the nearest multiple of π/2 (Cody and Waite), kept as a sum of two floats; then two
-    polynomials on ±π/4, exchanged and negated by the quadrant.
+    The nearest multiple of π/2 is subtracted (Cody and Waite) and the rest kept as a sum of two floats.
+    Two polynomials on ±π/4 follow, exchanged and negated according to the quadrant.
     """
     k = np.rint(angle * PER_HALF_PI)
     first = angle - k * HALF_PI_1

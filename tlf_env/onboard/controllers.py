@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import functools
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from pydantic import ValidationError, field_validator
 
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen
 from tlf_env.common.presets import is_file_name, preset_names, read_preset_or_file
+from tlf_env.onboard.kinds import EstimatorKind
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import Controller
 
@@ -19,7 +20,7 @@ class ControllerFile(Frozen):
     """What a controller file holds: the law's numbers, and fields that it asks of the scenario."""
 
     controller: Controller  # or the name of a preset
-    estimator: Literal["ekf", "ekf-slip", "truth"] | None = None  # None leaves it to the controller
+    estimator: EstimatorKind | None = None  # None leaves it to the controller
     ekf_slip: SlipEkfParameters | None = None
     found: dict[str, Any] | None = None  # how the numbers were found; nothing reads it
 

@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.models import Frozen, NonNegative, Positive, infinite_if_none
 from tlf_env.numerics.compiled import law
 
 
@@ -33,7 +33,7 @@ class TwistLimits(Frozen):
     cancel_slip: bool = False  # take the estimated slip off the wheels' twist
 
 
-class Limits(NamedTuple):
+class TwistLimitsRow(NamedTuple):
     """The same as the compiled law takes them; infinity where there is none."""
 
     forward_error: float
@@ -50,27 +50,23 @@ class Limits(NamedTuple):
     slip: float  # 1 if the estimated slip counts, else 0
 
 
-def limits_row(limits: TwistLimits, period_s: float) -> Limits:
+def twist_limits_row(limits: TwistLimits, period_s: float) -> TwistLimitsRow:
     """Limits for a control period, as the compiled law takes them."""
-
-    def finite(limit: float | None, factor: float = 1.0) -> float:
-        return math.inf if limit is None else limit * factor
-
     most, least = limits.acceleration_mm_s2, limits.turning_acceleration_mm_s2
     turning_loss = 0.0 if most is None or least is None else max(most - least, 0.0)
-    return Limits(
-        finite(limits.forward_error_mm),
-        finite(limits.lateral_error_mm),
-        finite(limits.braking_error_mm),
-        finite(limits.acceleration_mm_s2, period_s),
-        finite(limits.yaw_acceleration_rad_s2, period_s),
-        finite(limits.yaw_rate_rad_s),
-        finite(limits.lateral_acceleration_mm_s2),
-        turning_loss * period_s,
-        limits.free_speed_mm_s,
-        limits.free_reach_mm,
-        finite(limits.reverse_mm_s),
-        1.0 if limits.cancel_slip else 0.0,
+    return TwistLimitsRow(
+        forward_error=infinite_if_none(limits.forward_error_mm),
+        lateral_error=infinite_if_none(limits.lateral_error_mm),
+        braking_error=infinite_if_none(limits.braking_error_mm),
+        step_1=infinite_if_none(limits.acceleration_mm_s2, period_s),
+        step_2=infinite_if_none(limits.yaw_acceleration_rad_s2, period_s),
+        yaw_rate=infinite_if_none(limits.yaw_rate_rad_s),
+        lateral=infinite_if_none(limits.lateral_acceleration_mm_s2),
+        turning_loss=turning_loss * period_s,
+        free=limits.free_speed_mm_s,
+        free_reach=limits.free_reach_mm,
+        reverse=infinite_if_none(limits.reverse_mm_s),
+        slip=1.0 if limits.cancel_slip else 0.0,
     )
 
 
@@ -102,7 +98,7 @@ def within(value: float, centre: float, reach: float) -> float:
 
 @law
 def speed_range(
-    b_1: float, b_2: float, cruise: float, error: float, limits: Limits
+    b_1: float, b_2: float, cruise: float, error: float, limits: TwistLimitsRow
 ) -> tuple[float, float]:
     """Speeds (mm/s) that the body may be asked for next, if ``b`` is what its last command comes to.
 
@@ -130,7 +126,7 @@ def limited_twist(
     delta_2: float,
     cruise: float,
     error: float,
-    limits: Limits,
+    limits: TwistLimitsRow,
 ) -> tuple[float, float]:
     """Twist for the wheels (mm/s, rad/s) if the body shall have ``u``.
 

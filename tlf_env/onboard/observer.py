@@ -58,22 +58,22 @@ def observer_rates(
 
 
 @law
-def dead_reckoned(m: Message, duration: float) -> Message:
+def dead_reckoned(message: Message, duration: float) -> Message:
     """Where the sender is ``duration`` s after a message if it goes on with the twist it told.
 
     It is on a circle, so that two steps of any length are one step of both.
     """
-    turn = m.u_2 * duration
+    turn = message.u_2 * duration
     half = 0.5 * turn
     shorter = 1.0 - half * half / 6.0 if abs(half) < 1e-4 else math.sin(half) / half
-    chord = m.u_1 * duration * shorter
-    middle = m.theta + half
+    chord = message.u_1 * duration * shorter
+    middle = message.theta + half
     return Message(
-        m.x - chord * math.sin(middle),
-        m.y + chord * math.cos(middle),
-        m.theta + turn,
-        m.u_1,
-        m.u_2,
+        message.x - chord * math.sin(middle),
+        message.y + chord * math.cos(middle),
+        message.theta + turn,
+        message.u_1,
+        message.u_2,
     )
 
 

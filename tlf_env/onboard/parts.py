@@ -2,7 +2,7 @@
 
 A part is made by a *factory*, once per robot and once more at every reset: a class, a function, or
 the string ``"module:factory"``. It is called as ``factory(robot, period_s)`` with the robot's
-:class:`~tlf_env.physics.parameters.RobotParameters` and the period (s) at which the part will run.
+:class:`~tlf_env.physics.vehicle.RobotParameters` and the period (s) at which the part will run.
 """
 
 from __future__ import annotations

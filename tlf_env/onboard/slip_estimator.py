@@ -15,12 +15,20 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.models import Frozen, NonNegative, Positive, infinite_if_none
 from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.rows import replacing
 from tlf_env.numerics.trig import sincos
-from tlf_env.onboard.estimator import Estimate, certainty
+from tlf_env.onboard.estimator import (
+    Estimate,
+    corrected_pose,
+    inverse_innovation_covariance,
+    normalised_square,
+    pose_gain,
+)
 
 ROUGHNESS_TIME_S = 0.5  # over which the encoders' roughness is learned
+POSE_AND_SLIP = ("p_x1", "p_y1", "p_t1", "p_x2", "p_y2", "p_t2")  # covariances of pose and slip
 JUMP_NOISE = 4.0  # standard deviations of encoder noise below which nothing is a jump
 
 
@@ -70,13 +78,13 @@ class SlipEkf(NamedTuple):
     variance: float
     bound_1: float
     bound_2: float
-    learning: float  # share of a sample in the learned variance
-    least: float
-    factor: float
-    averaging: float  # share of a sample in the mean innovation
+    variance_weight: float  # share of a sample in the learned variance
+    least_variance: float
+    variance_factor: float
+    mean_weight: float  # share of a sample in the mean innovation
     threshold: float  # of the mean innovation's square, per variance of a fix
     most_surprise: float
-    fast: float  # mm per sample from which on surprise counts whole
+    surprise_speed: float  # mm per sample from which on surprise counts whole
     surprise_heading: float
     surprise_1: float
     surprise_2: float
@@ -84,8 +92,8 @@ class SlipEkf(NamedTuple):
     change_2: float  # rad per sample and sample
     grip_1: float  # likewise
     grip_2: float
-    unsure: float  # variance of slip for the square of a jump of increments, 1/s²
-    settling: float  # share of a sample in the learned roughness
+    jump_variance: float  # variance of slip for the square of a jump of increments, 1/s²
+    roughness_weight: float  # share of a sample in the learned roughness
 
 
 class SlipEstimate(NamedTuple):
@@ -108,14 +116,14 @@ class SlipEstimate(NamedTuple):
     variance: float  # of a fix, beyond where the filter began, mm²
     d_x: float  # last innovation, world axes, mm
     d_y: float
-    ahead: float  # mean innovation, forward and right, mm
-    aside: float
+    mean_forward: float  # mean innovation, forward and right, mm
+    mean_right: float
     u_1: float  # the wheels' last increments, mm and rad
     u_2: float
     spin_1: float  # what of them is spin, mm and rad
     spin_2: float
-    rough_1: float  # mean square of their changes, by encoder noise mostly
-    rough_2: float
+    roughness_1: float  # mean square of their changes, by encoder noise mostly
+    roughness_2: float
 
 
 read_slip_ekf = reader(SlipEkf)
@@ -123,43 +131,43 @@ read_slip_estimate = reader(SlipEstimate)
 write_slip_estimate = writer(SlipEstimate)
 
 
-def share(dt_s: float, time_s: float) -> float:
+def sample_weight(dt_s: float, time_s: float) -> float:
     """Weight of one sample in a mean over ``time_s``."""
     return -math.expm1(-dt_s / time_s)
 
 
-def slip_ekf_constants(p: SlipEkfParameters, dt_s: float) -> SlipEkf:
+def slip_ekf_constants(parameters: SlipEkfParameters, dt_s: float) -> SlipEkf:
     """The filter's numbers for a sampling period of ``dt_s`` s, as the compiled law takes them."""
-    averaging = share(dt_s, p.surprise_time_s)
+    mean_weight = sample_weight(dt_s, parameters.surprise_time_s)
     return SlipEkf(
-        p.forward_noise_mm2_s * dt_s,
-        p.sideways_noise_mm2_s * dt_s,
-        p.heading_noise_rad2_s * dt_s,
-        p.delta_1_walk_mm2_s3 * dt_s,
-        p.delta_2_walk_rad2_s3 * dt_s,
-        p.fix_variance_mm2,
-        p.delta_1_bound_mm_s,
-        p.delta_2_bound_rad_s,
-        0.0 if p.fix_variance_time_s is None else share(dt_s, p.fix_variance_time_s),
-        p.least_fix_variance_mm2,
-        p.fix_variance_factor,
-        averaging,
-        math.inf
-        if p.surprise_threshold is None
-        else p.surprise_threshold * averaging / (2.0 - averaging),
-        p.most_surprise,
-        p.surprise_speed_mm_s * dt_s,
-        p.heading_surprise_rad2_s * dt_s,
-        p.delta_1_surprise_mm2_s3 * dt_s,
-        p.delta_2_surprise_rad2_s3 * dt_s,
-        math.inf if p.most_acceleration_mm_s2 is None else p.most_acceleration_mm_s2 * dt_s**2,
-        math.inf
-        if p.most_yaw_acceleration_rad_s2 is None
-        else p.most_yaw_acceleration_rad_s2 * dt_s**2,
-        p.grip_mm_s2 * dt_s**2,
-        p.yaw_grip_rad_s2 * dt_s**2,
-        (p.jump_uncertainty / dt_s) ** 2,
-        share(dt_s, ROUGHNESS_TIME_S),
+        forward=parameters.forward_noise_mm2_s * dt_s,
+        sideways=parameters.sideways_noise_mm2_s * dt_s,
+        heading=parameters.heading_noise_rad2_s * dt_s,
+        walk_1=parameters.delta_1_walk_mm2_s3 * dt_s,
+        walk_2=parameters.delta_2_walk_rad2_s3 * dt_s,
+        variance=parameters.fix_variance_mm2,
+        bound_1=parameters.delta_1_bound_mm_s,
+        bound_2=parameters.delta_2_bound_rad_s,
+        variance_weight=0.0
+        if parameters.fix_variance_time_s is None
+        else sample_weight(dt_s, parameters.fix_variance_time_s),
+        least_variance=parameters.least_fix_variance_mm2,
+        variance_factor=parameters.fix_variance_factor,
+        mean_weight=mean_weight,
+        threshold=math.inf
+        if parameters.surprise_threshold is None
+        else parameters.surprise_threshold * mean_weight / (2.0 - mean_weight),
+        most_surprise=parameters.most_surprise,
+        surprise_speed=parameters.surprise_speed_mm_s * dt_s,
+        surprise_heading=parameters.heading_surprise_rad2_s * dt_s,
+        surprise_1=parameters.delta_1_surprise_mm2_s3 * dt_s,
+        surprise_2=parameters.delta_2_surprise_rad2_s3 * dt_s,
+        change_1=infinite_if_none(parameters.most_acceleration_mm_s2, dt_s**2),
+        change_2=infinite_if_none(parameters.most_yaw_acceleration_rad_s2, dt_s**2),
+        grip_1=parameters.grip_mm_s2 * dt_s**2,
+        grip_2=parameters.yaw_grip_rad_s2 * dt_s**2,
+        jump_variance=(parameters.jump_uncertainty / dt_s) ** 2,
+        roughness_weight=sample_weight(dt_s, ROUGHNESS_TIME_S),
     )
 
 
@@ -173,13 +181,13 @@ def surprise(mean: float, variance: float, ekf: SlipEkf) -> float:
 
 
 @law
-def held(value: float, end: float) -> float:
+def clamped_from_zero(value: float, end: float) -> float:
     """``value`` held between 0 and ``end``."""
     return min(max(value, min(end, 0.0)), max(end, 0.0))
 
 
 @law
-def jumps(
+def split_change(
     change: float, beyond: float, spin: float, most: float, rough: float, grip: float
 ) -> tuple[float, float, float]:
     """What of a change of the wheels' increment was usual, what the floor did, and their new spin.
@@ -190,17 +198,24 @@ def jumps(
     """
     most += JUMP_NOISE * math.sqrt(rough)
     usual = min(max(change, -most), most)
-    away = held(change - usual, beyond)
+    away = clamped_from_zero(change - usual, beyond)
     spun = spin + (change - usual - away)
-    regained = held(away, -spun)
+    regained = clamped_from_zero(away, -spun)
     spun += regained
-    return usual, away - regained, spun - held(spun, math.copysign(grip, spun))
+    return usual, away - regained, spun - clamped_from_zero(spun, math.copysign(grip, spun))
+
+
+predicted_slip = replacing(
+    SlipEstimate,
+    *("delta_1", "delta_2", *POSE_AND_SLIP, "p_11", "p_22"),
+    *("u_1", "u_2", "spin_1", "spin_2", "roughness_1", "roughness_2"),
+)
 
 
 @law
 def predict_with_slip(
-    e: Estimate,
-    z: SlipEstimate,
+    estimate: Estimate,
+    slip: SlipEstimate,
     ekf: SlipEkf,
     u_1: float,
     u_2: float,
@@ -213,142 +228,139 @@ def predict_with_slip(
     The wheels' increments are u₁ (mm) and u₂ (rad); ``asked`` is what was asked of them, or their last
     increments where nothing was.
     """
-    change_1, change_2 = u_1 - z.u_1, u_2 - z.u_2
-    usual_1, jump_1, spin_1 = jumps(
-        change_1, u_1 - asked_1, z.spin_1, ekf.change_1, z.rough_1, ekf.grip_1
+    change_1, change_2 = u_1 - slip.u_1, u_2 - slip.u_2
+    usual_1, jump_1, spin_1 = split_change(
+        change_1, u_1 - asked_1, slip.spin_1, ekf.change_1, slip.roughness_1, ekf.grip_1
     )
-    usual_2, jump_2, spin_2 = jumps(
-        change_2, u_2 - asked_2, z.spin_2, ekf.change_2, z.rough_2, ekf.grip_2
+    usual_2, jump_2, spin_2 = split_change(
+        change_2, u_2 - asked_2, slip.spin_2, ekf.change_2, slip.roughness_2, ekf.grip_2
     )
-    delta_1, delta_2 = z.delta_1 - jump_1 / dt, z.delta_2 - jump_2 / dt
+    delta_1, delta_2 = slip.delta_1 - jump_1 / dt, slip.delta_2 - jump_2 / dt
     moved, turned = u_1 - spin_1 + delta_1 * dt, u_2 - spin_2 + delta_2 * dt
-    middle = e.theta + 0.5 * turned
-    noise = max(ekf.variance + z.variance, ekf.least)
-    speed = min(abs(u_1) / ekf.fast, 1.0)
-    forward = speed * speed * surprise(z.ahead, noise, ekf)
-    sideways = speed * speed * surprise(z.aside, noise, ekf)
+    middle = estimate.theta + 0.5 * turned
+    noise = max(ekf.variance + slip.variance, ekf.least_variance)
+    speed = min(abs(u_1) / ekf.surprise_speed, 1.0)
+    forward = speed * speed * surprise(slip.mean_forward, noise, ekf)
+    sideways = speed * speed * surprise(slip.mean_right, noise, ekf)
     sin, cos = sincos(middle)
     # F = I but for ∂(x, y)/∂θ = f, ∂(x, y)/∂δ₁ = h, ∂(x, y)/∂δ₂ = g, ∂θ/∂δ₂ = dt.
     f_x, f_y = -moved * cos, -moved * sin
     h_x, h_y = -sin * dt, cos * dt
     g_x, g_y = 0.5 * dt * f_x, 0.5 * dt * f_y
-    m_xx = e.p_xx + f_x * e.p_xt + h_x * z.p_x1 + g_x * z.p_x2
-    m_xy = e.p_xy + f_x * e.p_yt + h_x * z.p_y1 + g_x * z.p_y2
-    m_xt = e.p_xt + f_x * e.p_tt + h_x * z.p_t1 + g_x * z.p_t2
-    m_x1 = z.p_x1 + f_x * z.p_t1 + h_x * z.p_11 + g_x * z.p_12
-    m_x2 = z.p_x2 + f_x * z.p_t2 + h_x * z.p_12 + g_x * z.p_22
-    m_yy = e.p_yy + f_y * e.p_yt + h_y * z.p_y1 + g_y * z.p_y2
-    m_yt = e.p_yt + f_y * e.p_tt + h_y * z.p_t1 + g_y * z.p_t2
-    m_y1 = z.p_y1 + f_y * z.p_t1 + h_y * z.p_11 + g_y * z.p_12
-    m_y2 = z.p_y2 + f_y * z.p_t2 + h_y * z.p_12 + g_y * z.p_22
-    m_tt = e.p_tt + dt * z.p_t2
-    m_t1 = z.p_t1 + dt * z.p_12
-    m_t2 = z.p_t2 + dt * z.p_22
+    # M = F P, then F P Fᵀ + Q.
+    m_xx = estimate.p_xx + f_x * estimate.p_xt + h_x * slip.p_x1 + g_x * slip.p_x2
+    m_xy = estimate.p_xy + f_x * estimate.p_yt + h_x * slip.p_y1 + g_x * slip.p_y2
+    m_xt = estimate.p_xt + f_x * estimate.p_tt + h_x * slip.p_t1 + g_x * slip.p_t2
+    m_x1 = slip.p_x1 + f_x * slip.p_t1 + h_x * slip.p_11 + g_x * slip.p_12
+    m_x2 = slip.p_x2 + f_x * slip.p_t2 + h_x * slip.p_12 + g_x * slip.p_22
+    m_yy = estimate.p_yy + f_y * estimate.p_yt + h_y * slip.p_y1 + g_y * slip.p_y2
+    m_yt = estimate.p_yt + f_y * estimate.p_tt + h_y * slip.p_t1 + g_y * slip.p_t2
+    m_y1 = slip.p_y1 + f_y * slip.p_t1 + h_y * slip.p_11 + g_y * slip.p_12
+    m_y2 = slip.p_y2 + f_y * slip.p_t2 + h_y * slip.p_12 + g_y * slip.p_22
+    m_tt = estimate.p_tt + dt * slip.p_t2
+    m_t1 = slip.p_t1 + dt * slip.p_12
+    m_t2 = slip.p_t2 + dt * slip.p_22
     return (
         Estimate(
-            e.x - moved * sin,
-            e.y + moved * cos,
-            e.theta + turned,
-            m_xx
+            x=estimate.x - moved * sin,
+            y=estimate.y + moved * cos,
+            theta=estimate.theta + turned,
+            p_xx=m_xx
             + (f_x * m_xt + h_x * m_x1 + g_x * m_x2)
             + (sin * sin * ekf.forward + cos * cos * ekf.sideways),
-            m_xy
+            p_xy=m_xy
             + (f_y * m_xt + h_y * m_x1 + g_y * m_x2)
             + sin * cos * (ekf.sideways - ekf.forward),
-            m_xt + dt * m_x2,
-            m_yy
+            p_xt=m_xt + dt * m_x2,
+            p_yy=m_yy
             + (f_y * m_yt + h_y * m_y1 + g_y * m_y2)
             + (cos * cos * ekf.forward + sin * sin * ekf.sideways),
-            m_yt + dt * m_y2,
-            m_tt + dt * m_t2 + ekf.heading + ekf.surprise_heading * sideways,
+            p_yt=m_yt + dt * m_y2,
+            p_tt=m_tt + dt * m_t2 + ekf.heading + ekf.surprise_heading * sideways,
         ),
-        SlipEstimate(
-            delta_1,
-            delta_2,
-            m_x1,
-            m_y1,
-            m_t1,
-            m_x2,
-            m_y2,
-            m_t2,
-            z.p_11 + ekf.walk_1 + ekf.surprise_1 * forward + ekf.unsure * jump_1 * jump_1,
-            z.p_12,
-            z.p_22 + ekf.walk_2 + ekf.surprise_2 * sideways + ekf.unsure * jump_2 * jump_2,
-            z.variance,
-            z.d_x,
-            z.d_y,
-            z.ahead,
-            z.aside,
-            u_1,
-            u_2,
-            spin_1,
-            spin_2,
-            z.rough_1 + ekf.settling * (usual_1 * usual_1 - z.rough_1),
-            z.rough_2 + ekf.settling * (usual_2 * usual_2 - z.rough_2),
+        predicted_slip(
+            slip,
+            delta_1=delta_1,
+            delta_2=delta_2,
+            p_x1=m_x1,
+            p_y1=m_y1,
+            p_t1=m_t1,
+            p_x2=m_x2,
+            p_y2=m_y2,
+            p_t2=m_t2,
+            p_11=slip.p_11
+            + ekf.walk_1
+            + ekf.surprise_1 * forward
+            + ekf.jump_variance * jump_1 * jump_1,
+            p_22=slip.p_22
+            + ekf.walk_2
+            + ekf.surprise_2 * sideways
+            + ekf.jump_variance * jump_2 * jump_2,
+            u_1=u_1,
+            u_2=u_2,
+            spin_1=spin_1,
+            spin_2=spin_2,
+            roughness_1=slip.roughness_1
+            + ekf.roughness_weight * (usual_1 * usual_1 - slip.roughness_1),
+            roughness_2=slip.roughness_2
+            + ekf.roughness_weight * (usual_2 * usual_2 - slip.roughness_2),
         ),
     )
 
 
+corrected_slip = replacing(
+    SlipEstimate,
+    *("delta_1", "delta_2", *POSE_AND_SLIP, "p_11", "p_12", "p_22"),
+    *("variance", "d_x", "d_y", "mean_forward", "mean_right"),
+)
+
+
 @law
 def correct_with_slip(
-    e: Estimate, z: SlipEstimate, ekf: SlipEkf, x: float, y: float
+    estimate: Estimate, slip: SlipEstimate, ekf: SlipEkf, x: float, y: float
 ) -> tuple[Estimate, SlipEstimate, float, float, float]:
     """Update with a position fix (mm); the slip estimates are held within their bounds.
 
     Returns the estimates, the innovation in world axes (mm), and its normalised square (NIS).
     """
-    known = ekf.variance + z.variance
-    i_xx, i_xy, i_yy = certainty(e, max(ekf.factor * known, ekf.least))
-    d_x, d_y = x - e.x, y - e.y
+    known = ekf.variance + slip.variance
+    i_xx, i_xy, i_yy = inverse_innovation_covariance(
+        estimate, max(ekf.variance_factor * known, ekf.least_variance)
+    )
+    d_x, d_y = x - estimate.x, y - estimate.y
     # Successive innovations differ by twice the variance of a fix; a slow error cancels.
-    step_x, step_y = d_x - z.d_x, d_y - z.d_y
-    sin, cos = sincos(e.theta)
-    ahead, aside = cos * d_y - sin * d_x, cos * d_x + sin * d_y
-    # Gain l = P Hᵀ S⁻¹, rows x, y, θ, δ₁, δ₂.
-    l_xx, l_xy = e.p_xx * i_xx + e.p_xy * i_xy, e.p_xx * i_xy + e.p_xy * i_yy
-    l_yx, l_yy = e.p_xy * i_xx + e.p_yy * i_xy, e.p_xy * i_xy + e.p_yy * i_yy
-    l_tx, l_ty = e.p_xt * i_xx + e.p_yt * i_xy, e.p_xt * i_xy + e.p_yt * i_yy
-    l_1x, l_1y = z.p_x1 * i_xx + z.p_y1 * i_xy, z.p_x1 * i_xy + z.p_y1 * i_yy
-    l_2x, l_2y = z.p_x2 * i_xx + z.p_y2 * i_xy, z.p_x2 * i_xy + z.p_y2 * i_yy
-    delta_1 = z.delta_1 + l_1x * d_x + l_1y * d_y
-    delta_2 = z.delta_2 + l_2x * d_x + l_2y * d_y
+    step_x, step_y = d_x - slip.d_x, d_y - slip.d_y
+    sin, cos = sincos(estimate.theta)
+    forward, right = cos * d_y - sin * d_x, cos * d_x + sin * d_y
+    # The gain's rows x, y, θ, and those of δ₁ and δ₂.
+    gain = pose_gain(estimate, i_xx, i_xy, i_yy)
+    l_1x, l_1y = slip.p_x1 * i_xx + slip.p_y1 * i_xy, slip.p_x1 * i_xy + slip.p_y1 * i_yy
+    l_2x, l_2y = slip.p_x2 * i_xx + slip.p_y2 * i_xy, slip.p_x2 * i_xy + slip.p_y2 * i_yy
+    delta_1 = slip.delta_1 + l_1x * d_x + l_1y * d_y
+    delta_2 = slip.delta_2 + l_2x * d_x + l_2y * d_y
+    step_2 = step_x * step_x + step_y * step_y
     return (
-        Estimate(
-            e.x + l_xx * d_x + l_xy * d_y,
-            e.y + l_yx * d_x + l_yy * d_y,
-            e.theta + l_tx * d_x + l_ty * d_y,
-            e.p_xx - l_xx * e.p_xx - l_xy * e.p_xy,
-            e.p_xy - l_xx * e.p_xy - l_xy * e.p_yy,
-            e.p_xt - l_xx * e.p_xt - l_xy * e.p_yt,
-            e.p_yy - l_yx * e.p_xy - l_yy * e.p_yy,
-            e.p_yt - l_yx * e.p_xt - l_yy * e.p_yt,
-            e.p_tt - l_tx * e.p_xt - l_ty * e.p_yt,
-        ),
-        SlipEstimate(
-            min(max(delta_1, -ekf.bound_1), ekf.bound_1),
-            min(max(delta_2, -ekf.bound_2), ekf.bound_2),
-            z.p_x1 - l_xx * z.p_x1 - l_xy * z.p_y1,
-            z.p_y1 - l_yx * z.p_x1 - l_yy * z.p_y1,
-            z.p_t1 - l_tx * z.p_x1 - l_ty * z.p_y1,
-            z.p_x2 - l_xx * z.p_x2 - l_xy * z.p_y2,
-            z.p_y2 - l_yx * z.p_x2 - l_yy * z.p_y2,
-            z.p_t2 - l_tx * z.p_x2 - l_ty * z.p_y2,
-            z.p_11 - l_1x * z.p_x1 - l_1y * z.p_y1,
-            z.p_12 - l_1x * z.p_x2 - l_1y * z.p_y2,
-            z.p_22 - l_2x * z.p_x2 - l_2y * z.p_y2,
-            z.variance + ekf.learning * (0.25 * (step_x * step_x + step_y * step_y) - known),
-            d_x,
-            d_y,
-            z.ahead + ekf.averaging * (ahead - z.ahead),
-            z.aside + ekf.averaging * (aside - z.aside),
-            z.u_1,
-            z.u_2,
-            z.spin_1,
-            z.spin_2,
-            z.rough_1,
-            z.rough_2,
+        corrected_pose(estimate, gain, d_x, d_y),
+        corrected_slip(
+            slip,
+            delta_1=min(max(delta_1, -ekf.bound_1), ekf.bound_1),
+            delta_2=min(max(delta_2, -ekf.bound_2), ekf.bound_2),
+            p_x1=slip.p_x1 - gain.xx * slip.p_x1 - gain.xy * slip.p_y1,
+            p_y1=slip.p_y1 - gain.yx * slip.p_x1 - gain.yy * slip.p_y1,
+            p_t1=slip.p_t1 - gain.tx * slip.p_x1 - gain.ty * slip.p_y1,
+            p_x2=slip.p_x2 - gain.xx * slip.p_x2 - gain.xy * slip.p_y2,
+            p_y2=slip.p_y2 - gain.yx * slip.p_x2 - gain.yy * slip.p_y2,
+            p_t2=slip.p_t2 - gain.tx * slip.p_x2 - gain.ty * slip.p_y2,
+            p_11=slip.p_11 - l_1x * slip.p_x1 - l_1y * slip.p_y1,
+            p_12=slip.p_12 - l_1x * slip.p_x2 - l_1y * slip.p_y2,
+            p_22=slip.p_22 - l_2x * slip.p_x2 - l_2y * slip.p_y2,
+            variance=slip.variance + ekf.variance_weight * (0.25 * step_2 - known),
+            d_x=d_x,
+            d_y=d_y,
+            mean_forward=slip.mean_forward + ekf.mean_weight * (forward - slip.mean_forward),
+            mean_right=slip.mean_right + ekf.mean_weight * (right - slip.mean_right),
         ),
         d_x,
         d_y,
-        d_x * (i_xx * d_x + i_xy * d_y) + d_y * (i_xy * d_x + i_yy * d_y),
+        normalised_square(d_x, d_y, i_xx, i_xy, i_yy),
     )

@@ -37,7 +37,7 @@ class SpacingRow(NamedTuple):
     behind: float
 
 
-class Heard(NamedTuple):
+class Predecessor(NamedTuple):
     """A predecessor in the robot's estimated body frame: place (mm), turn, and twist (mm/s, rad/s)."""
 
     forward: float
@@ -77,19 +77,21 @@ def approach_speed(room: float, leaving: float, row: SpacingRow) -> float:
 
 
 @law
-def spaced_twist(u_1: float, u_2: float, heard: Heard, row: SpacingRow) -> tuple[float, float]:
+def spaced_twist(
+    u_1: float, u_2: float, predecessor: Predecessor, row: SpacingRow
+) -> tuple[float, float]:
     """The twist (mm/s, rad/s) nearest to ``u`` that keeps the distance from a predecessor."""
     behind = row.behind
-    d_forward = heard.forward + behind - behind * heard.cos_turn
-    d_right = heard.right + behind * heard.sin_turn
+    d_forward = predecessor.forward + behind - behind * predecessor.cos_turn
+    d_right = predecessor.right + behind * predecessor.sin_turn
     distance = math.sqrt(d_forward * d_forward + d_right * d_right)
     if not distance > 0.0:
         return u_1, u_2
     n_forward, n_right = d_forward / distance, d_right / distance
-    swing = behind * heard.u_2
-    leaving = n_forward * (heard.u_1 * heard.cos_turn + swing * heard.sin_turn) + n_right * (
-        swing * heard.cos_turn - heard.u_1 * heard.sin_turn
-    )
+    swing = behind * predecessor.u_2
+    leaving = n_forward * (
+        predecessor.u_1 * predecessor.cos_turn + swing * predecessor.sin_turn
+    ) + n_right * (swing * predecessor.cos_turn - predecessor.u_1 * predecessor.sin_turn)
     approach = approach_speed(distance - row.distance, leaving, row)
     excess = n_forward * u_1 + n_right * behind * u_2 - approach
     if excess <= 0.0:

@@ -12,7 +12,7 @@ from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.common.presets import read_preset_or_file
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.trig import sincos
-from tlf_env.onboard.limiter import Limits, TwistLimits, limits_row
+from tlf_env.onboard.limiter import TwistLimits, TwistLimitsRow, twist_limits_row
 from tlf_env.onboard.spacing import Spacing, SpacingRow, spacing_row
 
 
@@ -68,13 +68,13 @@ class ControllerRow(NamedTuple):
     """The same numbers as the compiled law takes them."""
 
     gains: Gains
-    limits: Limits
+    limits: TwistLimitsRow
     spacing: SpacingRow
     lead: float  # as a fraction of the time to the first preview
 
 
 def controller_row(
-    known: Controller, period_s: float, preview_s: tuple[float, ...] = ()
+    controller: Controller, period_s: float, preview_s: tuple[float, ...] = ()
 ) -> ControllerRow:
     """Gains and limits for a control period and preview times (s), as the compiled law takes them.
 
@@ -83,15 +83,15 @@ def controller_row(
     ValueError
         if there is a lead and no preview to make it from.
     """
-    if known.lead_s and not (preview_s and preview_s[0] > 0):
+    if controller.lead_s and not (preview_s and preview_s[0] > 0):
         raise ValueError(
-            f"lead_s {known.lead_s} needs a first preview above 0, got preview_s {preview_s}"
+            f"lead_s {controller.lead_s} needs a first preview above 0, got preview_s {preview_s}"
         )
-    lead = known.lead_s / preview_s[0] if known.lead_s else 0.0
+    lead = controller.lead_s / preview_s[0] if controller.lead_s else 0.0
     return ControllerRow(
-        gains_row(known.gains),
-        limits_row(known.limits, period_s),
-        spacing_row(known.spacing),
+        gains_row(controller.gains),
+        twist_limits_row(controller.limits, period_s),
+        spacing_row(controller.spacing),
         lead,
     )
 

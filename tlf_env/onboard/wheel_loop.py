@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 from tlf_env.common.models import Frozen, Positive
 from tlf_env.numerics.compiled import law, reader, writer
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
 
 class WheelLoopParameters(Frozen):
@@ -24,7 +24,7 @@ class WheelLoopParameters(Frozen):
     pole_rad_s: Positive = 2.0
 
 
-class WheelLoop(NamedTuple):
+class WheelLoopRow(NamedTuple):
     """Digital form of eq. (13), torques in mN·mm: gain, integral step, lag decay and lag step."""
 
     gain: float
@@ -42,27 +42,29 @@ class WheelLoopState(NamedTuple):
     lag_r: float
 
 
-read_wheel_loop = reader(WheelLoop)
+read_wheel_loop = reader(WheelLoopRow)
 read_loop_state = reader(WheelLoopState)
 write_loop_state = writer(WheelLoopState)
 
 
-def digital_wheel_loop(p: WheelLoopParameters, dt_s: float) -> WheelLoop:
+def digital_wheel_loop(parameters: WheelLoopParameters, dt_s: float) -> WheelLoopRow:
     """Eq. (13) at a period of ``dt_s`` s: exact decay of the lag, and the current error already in."""
-    integral = p.gain_Nmm_s * p.zeros_0 / p.pole_rad_s
-    lag = -p.gain_Nmm_s * (p.pole_rad_s**2 - p.zeros_1 * p.pole_rad_s + p.zeros_0) / p.pole_rad_s
-    decay = math.exp(-p.pole_rad_s * dt_s)
-    return WheelLoop(
-        p.gain_Nmm_s * MILLINEWTON_PER_NEWTON,
-        integral * dt_s * MILLINEWTON_PER_NEWTON,
-        decay,
-        lag * (1 - decay) / p.pole_rad_s * MILLINEWTON_PER_NEWTON,
+    k, p = parameters.gain_Nmm_s, parameters.pole_rad_s
+    a_1, a_0 = parameters.zeros_1, parameters.zeros_0
+    integral = k * a_0 / p
+    lag = -k * (p**2 - a_1 * p + a_0) / p
+    decay = math.exp(-p * dt_s)
+    return WheelLoopRow(
+        gain=k * MILLINEWTON_PER_NEWTON,
+        integral_step=integral * dt_s * MILLINEWTON_PER_NEWTON,
+        lag_decay=decay,
+        lag_step=lag * (1 - decay) / p * MILLINEWTON_PER_NEWTON,
     )
 
 
 @law
 def wheel_torque(
-    error: float, integral: float, lag: float, loop: WheelLoop, limit: float
+    error: float, integral: float, lag: float, loop: WheelLoopRow, limit: float
 ) -> tuple[float, float, float]:
     """Torque for a speed error in rad/s; returns ``(torque, integral, lag)``, torque within ±``limit``.
 

@@ -1,4 +1,4 @@
 """The robots as bodies: parameters, friction laws, the wheel kernel and the plants.
 
-Knows torques and floors; knows no reference, no estimate and no reward.
+The inputs are torques and floors. Nothing here depends on references, estimates or rewards.
 """

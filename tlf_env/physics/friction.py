@@ -1,4 +1,4 @@
-"""Friction laws: the coefficient's curve, and a Coulomb disc solved exactly."""
+"""Friction laws: the curve of the coefficient, and the exact solution of Coulomb friction in a plane."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ CIRCLE_TOLERANCE = 1e-12  # relative
 def coefficient(
     speed: float, mu_static: float, mu_dynamic: float, stiction_speed: float, dynamic_speed: float
 ) -> float:
-    """μ(|v|) of Fig. 3(b): static up to v_s, dynamic from v_d on, a cubic step between. Speeds in mm/s."""
+    """μ(|v|) of Fig. 3(b): static up to v_s, dynamic above v_d, a cubic step between. Speeds in mm/s."""
     x = (abs(speed) - stiction_speed) / (dynamic_speed - stiction_speed)
     x = min(max(x, 0.0), 1.0)
     return mu_static + (mu_dynamic - mu_static) * x * x * (3.0 - 2.0 * x)
@@ -28,19 +28,19 @@ def disc(
 
     ``W = [[w_ee, w_ef], [w_ef, w_ff]]`` is the contact's inverse mass and ``b`` its slip velocity
     without the impulse. Returns ``(p_e, p_f, λ)`` with slip = b + W p: either slip = 0 and |p| ≤ radius
-    (λ = 0), or |p| = radius and slip = −λ p: the impulse opposes the slip exactly.
+    (λ = 0), or |p| = radius and slip = −λ p, exactly opposite to the impulse.
     """
     if radius <= 0.0:
         return 0.0, 0.0, math.inf
-    # Divided by, not multiplied with its inverse: a robot at rest shows the last digit.
+    # Divided by det, not multiplied by 1/det: at rest the difference shows in the last digit.
     det = w_ee * w_ff - w_ef * w_ef
     p_e = (w_ef * b_f - w_ff * b_e) / det
     p_f = (w_ef * b_e - w_ee * b_f) / det
     square = p_e * p_e + p_f * p_f
     if square <= radius * radius:
         return p_e, p_f, 0.0
-    # Find λ with |(W + λ1)⁻¹ b| = radius: Newton on 1/|p|, which is concave in λ, so that from the second
-    # step on λ rises to the root. It starts with the step from λ = ∞.
+    # Find λ with |(W + λ1)⁻¹ b| = radius: Newton's method on 1/|p|, which is concave in λ, so that λ
+    # increases to the root from the second step on. The first step is that from λ = ∞.
     inverse_radius = 1.0 / radius
     size = b_e * b_e + b_f * b_f
     weighted = w_ee * b_e * b_e + 2.0 * w_ef * b_e * b_f + w_ff * b_f * b_f

@@ -1,7 +1,7 @@
 """The wheel kernel: one substep of one robot, implicit in all friction (``docs/physics.md``).
 
-Frames are taken at mid attitude; torques and pushes enter as impulses; then the impulses of floor and
-friction follow, in closed form where all wheels roll (:func:`roll`) and by sweeps where not (:func:`slide`).
+Frames are taken at mid attitude, and torques and pushes enter as impulses. Then the impulses of floor and
+friction are solved: in closed form if all wheels roll (:func:`roll`), otherwise by sweeps (:func:`slide`).
 """
 
 from __future__ import annotations
@@ -9,28 +9,31 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import block, law
+from tlf_env.numerics.rows import replacing
 from tlf_env.numerics.trig import sincos
-from tlf_env.physics.limits import Limits, limits
+from tlf_env.physics.friction_limits import FrictionLimits, friction_limits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.rolling import rolling
 from tlf_env.physics.state import Contact, Floor, Motion, Push, Rates
 from tlf_env.physics.sweeps import sweep
 
+with_torques = replacing(Rates, "w", "omega_l", "omega_r")
 
-class Setting(NamedTuple):
-    """What the impulses of floor and friction are solved for."""
+
+class SubstepFrame(NamedTuple):
+    """Data of a substep from which the impulses of floor and friction are solved."""
 
     sin_t: float  # heading at mid attitude
     cos_t: float
     sin_p: float  # castor angle at mid attitude
     cos_p: float
-    before: Rates  # velocities at the substep's start
-    free: Rates  # the same, with torques and pushes
-    limits: Limits
+    before: Rates  # velocities at the start of the substep
+    free: Rates  # with torques and pushes, without floor and friction
+    limits: FrictionLimits
 
 
 @law
-def setting(
+def substep_frame(
     body: Body,
     motion: Motion,
     contact: Contact,
@@ -39,51 +42,55 @@ def setting(
     torque_l: float,
     torque_r: float,
     dt: float,
-) -> Setting:
-    """Frames at mid attitude, velocities without floor and friction, and the friction's limits."""
+) -> SubstepFrame:
+    """Frames at mid attitude, velocities without floor and friction, and limits of the friction impulses."""
     sin_t, cos_t = sincos(motion.theta + 0.5 * dt * motion.w)
     sin_p, cos_p = sincos(motion.psi - motion.theta + 0.5 * dt * (motion.s - motion.w))
     v_x = motion.v_x + push.f_x * dt * body.inverse_m
     v_y = motion.v_y + push.f_y * dt * body.inverse_m
     before = Rates(
-        cos_t * v_x + sin_t * v_y,
-        -sin_t * v_x + cos_t * v_y,
-        motion.w,
-        motion.s,
-        motion.omega_l,
-        motion.omega_r,
-        motion.omega_c,
+        v_e=cos_t * v_x + sin_t * v_y,
+        v_f=-sin_t * v_x + cos_t * v_y,
+        w=motion.w,
+        s=motion.s,
+        omega_l=motion.omega_l,
+        omega_r=motion.omega_r,
+        omega_c=motion.omega_c,
     )
-    free = Rates(
-        before.v_e,
-        before.v_f,
-        motion.w + push.torque * dt * body.inverse_I,
-        motion.s,
-        motion.omega_l + torque_l * dt * body.inverse_J,
-        motion.omega_r + torque_r * dt * body.inverse_J,
-        motion.omega_c,
+    free = with_torques(
+        before,
+        w=motion.w + push.torque * dt * body.inverse_I,
+        omega_l=motion.omega_l + torque_l * dt * body.inverse_J,
+        omega_r=motion.omega_r + torque_r * dt * body.inverse_J,
     )
-    most = limits(body, motion, contact, floor, dt)
-    return Setting(sin_t, cos_t, sin_p, cos_p, before, free, most)
+    return SubstepFrame(
+        sin_t=sin_t,
+        cos_t=cos_t,
+        sin_p=sin_p,
+        cos_p=cos_p,
+        before=before,
+        free=free,
+        limits=friction_limits(body, motion, contact, floor, dt),
+    )
 
 
 @law
-def moved(motion: Motion, at: Setting, after: Rates, dt: float) -> Motion:
-    """The motion with new velocities, in world axes; fork and wheel angles advanced with them."""
+def moved(motion: Motion, frame: SubstepFrame, after: Rates, dt: float) -> Motion:
+    """The motion with new velocities, in world axes; fork and wheel angles are advanced with them."""
     return Motion(
-        motion.x,
-        motion.y,
-        motion.theta,
-        motion.psi + dt * after.s,
-        at.cos_t * after.v_e - at.sin_t * after.v_f,
-        at.sin_t * after.v_e + at.cos_t * after.v_f,
-        after.w,
-        after.s,
-        after.omega_l,
-        after.omega_r,
-        after.omega_c,
-        motion.angle_l + dt * after.omega_l,
-        motion.angle_r + dt * after.omega_r,
+        x=motion.x,
+        y=motion.y,
+        theta=motion.theta,
+        psi=motion.psi + dt * after.s,
+        v_x=frame.cos_t * after.v_e - frame.sin_t * after.v_f,
+        v_y=frame.sin_t * after.v_e + frame.cos_t * after.v_f,
+        w=after.w,
+        s=after.s,
+        omega_l=after.omega_l,
+        omega_r=after.omega_r,
+        omega_c=after.omega_c,
+        angle_l=motion.angle_l + dt * after.omega_l,
+        angle_r=motion.angle_r + dt * after.omega_r,
     )
 
 
@@ -98,10 +105,12 @@ def roll(
     torque_r: float,
     dt: float,
 ) -> tuple[bool, Motion, Contact]:
-    """A substep in closed form, and whether it holds: whether all three wheels roll."""
-    at = setting(body, motion, contact, floor, push, torque_l, torque_r, dt)
-    rolls, after, impulses = rolling(body, at.free, at.before, at.cos_p, at.sin_p, floor, at.limits)
-    return rolls, moved(motion, at, after, dt), impulses
+    """Whether all three wheels roll, and the substep in closed form, which is valid only then."""
+    frame = substep_frame(body, motion, contact, floor, push, torque_l, torque_r, dt)
+    rolls, after, impulses = rolling(
+        body, frame.free, frame.before, frame.cos_p, frame.sin_p, floor, frame.limits
+    )
+    return rolls, moved(motion, frame, after, dt), impulses
 
 
 @block
@@ -115,10 +124,12 @@ def slide(
     torque_r: float,
     dt: float,
 ) -> tuple[Motion, Contact]:
-    """A substep by sweeps, right whatever the wheels do."""
-    at = setting(body, motion, contact, floor, push, torque_l, torque_r, dt)
-    after, impulses = sweep(body, at.free, contact, at.cos_p, at.sin_p, floor, at.limits)
-    return moved(motion, at, after, dt), impulses
+    """A substep by sweeps, valid whether the wheels roll or slide."""
+    frame = substep_frame(body, motion, contact, floor, push, torque_l, torque_r, dt)
+    after, impulses = sweep(
+        body, frame.free, contact, frame.cos_p, frame.sin_p, floor, frame.limits
+    )
+    return moved(motion, frame, after, dt), impulses
 
 
 @block
@@ -132,9 +143,9 @@ def substep(
     torque_r: float,
     dt: float,
 ) -> tuple[Motion, Contact]:
-    """Velocities after one substep; the pose is left to :func:`tlf_env.physics.state.advance_pose`.
+    """Velocities after one substep; :func:`tlf_env.physics.state.advance_pose` advances the pose.
 
-    Torques in mN·mm, ``dt`` in s. Fork and wheel angles are advanced here with the new rates.
+    Torques in mN·mm, ``dt`` in s. Fork and wheel angles are advanced here, with the new rates.
     """
     rolls, after, impulses = roll(body, motion, contact, floor, push, torque_l, torque_r, dt)
     if rolls:

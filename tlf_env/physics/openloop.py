@@ -1,23 +1,22 @@
-"""One robot driven with given torques: no wheel loop, no torque limit. For checks against other plants."""
+"""One robot with given torques, without wheel loop and torque limit, for checks against other plants."""
 
 from __future__ import annotations
 
 import itertools
 import json
 import math
-import re
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from tlf_env.common.errors import one_line
-from tlf_env.common.files import atomic
+from tlf_env.common.errors import RepeatedKeyError, one_line
+from tlf_env.common.files import FILE_NAME, atomic
 from tlf_env.common.models import Frozen
 from tlf_env.numerics.compiled import driver
 from tlf_env.physics.kernel import substep
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, RobotParameters, body_array
+from tlf_env.physics.parameters import RobotParameters, body_array
 from tlf_env.physics.state import (
     Contact,
     Floor,
@@ -30,6 +29,7 @@ from tlf_env.physics.state import (
     write_contact,
     write_motion,
 )
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
 COLUMNS = (
     "t_s",
@@ -46,11 +46,10 @@ COLUMNS = (
 ROW_EVERY_S = 0.1
 MAX_DURATION_S = 1e5
 MAX_TORQUE_NMM = 1e6
-MAX_STEPS = 100_000_000
-# Far beyond any robot, and small enough that the plant's squares and products stay finite.
+MAX_SUBSTEPS = 100_000_000
+# Far beyond any robot, and small enough that squares and products in the plant stay finite.
 MAX_MM = 1e9  # and mm/s
 MAX_RAD = 1e4  # and rad/s
-NAME = re.compile(r"[\w][\w.+-]{0,99}")
 
 Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Torque = Annotated[Number, Field(ge=-MAX_TORQUE_NMM, le=MAX_TORQUE_NMM)]
@@ -59,7 +58,7 @@ Angle = Annotated[Number, Field(ge=-MAX_RAD, le=MAX_RAD)]
 
 
 class OpenLoopStart(Frozen):
-    """State of the axle's midpoint c, the castor and the wheels at t = 0."""
+    """State of the axle midpoint c, the castor and the wheels at t = 0."""
 
     x_mm: Length = 0.0
     y_mm: Length = 0.0
@@ -74,7 +73,7 @@ class OpenLoopStart(Frozen):
 
 
 class OpenLoopInput(Frozen):
-    """Torques (N·mm) that hold from ``from_s`` on."""
+    """Torques (N·mm) from ``from_s`` on, until the next input."""
 
     from_s: Annotated[Number, Field(ge=0, le=MAX_DURATION_S)] = 0.0
     torque_l_Nmm: Torque
@@ -97,14 +96,14 @@ class OpenLoopScenario(Frozen):
         rows = round(self.duration_s / ROW_EVERY_S)
         if rows < 1 or abs(rows * ROW_EVERY_S - self.duration_s) > 1e-9:
             raise ValueError(
-                f"duration_s {self.duration_s} must be a multiple of {ROW_EVERY_S} s, the rows' "
-                "distance, and at least one"
+                f"duration_s {self.duration_s} must be a multiple of {ROW_EVERY_S} s, the time between "
+                "rows, and at least that"
             )
         return self
 
 
 def initial_rows(start: OpenLoopStart, d_mm: float) -> tuple[np.ndarray, np.ndarray]:
-    """Motion and contact arrays ``(field, 1, 1)`` for a start; the solver's memory is zero."""
+    """Motion and contact arrays ``(field, 1, 1)`` at the start; contacts are zero."""
     sin, cos = math.sin(start.theta_rad), math.cos(start.theta_rad)
     right = start.right_mm_s + start.yaw_rad_s * d_mm
     motion = Motion(
@@ -139,7 +138,7 @@ def advance_open_loop(
 ) -> None:
     """Advance robot 0 in place by ``len(torques)`` substeps of ``dt`` s; torques (steps, 2) in mN·mm.
 
-    ``push`` is a constant external load at the centre of mass: world force (2,) in mN, torque in mN·mm.
+    ``push`` is a constant load at the centre of mass: force (2,) in mN in world axes, torque in mN·mm.
     """
     body = read_body(bodies, 0, 0)
     motion = read_motion(motions, 0, 0)
@@ -191,9 +190,9 @@ def run_open_loop(
         raise ValueError(
             f"dt_s {dt_s} must divide the {ROW_EVERY_S} s between rows, and be above 0"
         )
-    if scenario.duration_s / dt_s > MAX_STEPS:
+    if scenario.duration_s / dt_s > MAX_SUBSTEPS:
         raise ValueError(
-            f"dt_s {dt_s} makes more than {MAX_STEPS} steps of {scenario.duration_s} s"
+            f"dt_s {dt_s} makes more than {MAX_SUBSTEPS} steps of {scenario.duration_s} s"
         )
     per_row = round(ROW_EVERY_S / dt_s)
     if per_row < 1 or abs(per_row * dt_s - ROW_EVERY_S) > 1e-9:
@@ -215,16 +214,12 @@ def run_open_loop(
     return np.array(rows)
 
 
-class _RepeatedKeyError(ValueError):
-    """A JSON object has a key twice."""
-
-
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object; the standard reader would keep the last of two equal keys in silence."""
+    """A JSON object; the standard reader keeps the last of two equal keys without an error."""
     found: dict[str, Any] = {}
     for key, value in pairs:
         if key in found:
-            raise _RepeatedKeyError(f"the key {key!r} stands there twice")
+            raise RepeatedKeyError(f"the key {key!r} is repeated")
         found[key] = value
     return found
 
@@ -235,23 +230,23 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
     Raises
     ------
     ValueError
-        in one line, if the file is missing, is not JSON, or holds an impossible scenario.
+        in one line, if the file is missing, is not JSON, or contains an invalid scenario.
     """
     try:
         text = path.read_text(encoding="utf-8")
         data: Any = json.loads(text, object_pairs_hook=_without_repeats)
     except OSError as error:
         raise ValueError(f"cannot read {path}: {error.strerror}") from error
-    except _RepeatedKeyError as error:
+    except RepeatedKeyError as error:
         raise ValueError(f"{path}: {error}") from error
     except (ValueError, RecursionError) as error:
         raise ValueError(f"{path} is not JSON: {error}") from error
     if not isinstance(data, dict) or not data:
         raise ValueError(
-            f"{path} must hold an object of named scenarios, got {type(data).__name__}"
+            f"{path} must contain an object of named scenarios, got {type(data).__name__}"
         )
     for name in data:
-        if not NAME.fullmatch(name):
+        if not FILE_NAME.fullmatch(name):
             raise ValueError(f"{path}: the scenario name {name!r} cannot be a file name")
     try:
         return TypeAdapter(dict[str, OpenLoopScenario]).validate_python(data)
@@ -260,7 +255,7 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
 
 
 def write_rows(path: Path, rows: np.ndarray) -> Path:
-    """Write the rows of a run as CSV with the header :data:`COLUMNS`, atomically."""
+    """Write the rows of a run as CSV with the header :data:`COLUMNS`, completely or not at all."""
     with atomic(path, encoding="utf-8") as file:
         file.write(",".join(COLUMNS) + "\n")
         np.savetxt(file, rows, fmt="%.12g", delimiter=",")

@@ -1,4 +1,4 @@
-"""Every number of the robot's body: Table I of the paper, and the values chosen where it is silent.
+"""Parameters of the robot's body: Table I of the paper, and chosen values for what is not in it.
 
 Units: mm, kg, s, rad; torques and torque limits N·mm; inertias kg·mm².
 """
@@ -12,16 +12,16 @@ from pydantic import Field, FiniteFloat, model_validator
 
 from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.numerics.compiled import law
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
-MILLINEWTON_PER_NEWTON = 1000.0
 LOAD_SPLIT_TOLERANCE = 1e-9
 
 
 class FrictionCurve(Frozen):
-    """Friction coefficient against speed (paper, Fig. 3b): static, then a smooth fall to dynamic.
+    """Friction coefficient against speed (paper, Fig. 3b): static, then a smooth decrease to dynamic.
 
-    ``mu_static`` holds up to ``stiction_speed_mm_s`` (v_s), ``mu_dynamic`` from ``dynamic_speed_mm_s``
-    (v_d) on. At zero speed the law is set-valued: true stick.
+    ``mu_static`` applies up to ``stiction_speed_mm_s`` (v_s), ``mu_dynamic`` above
+    ``dynamic_speed_mm_s`` (v_d). At zero speed the law is set-valued: true stiction.
     """
 
     mu_static: NonNegative
@@ -33,7 +33,7 @@ class FrictionCurve(Frozen):
     def _check(self) -> Self:
         if self.mu_dynamic > self.mu_static:
             raise ValueError(
-                f"mu_dynamic {self.mu_dynamic} is above mu_static {self.mu_static}; it must not be"
+                f"mu_dynamic {self.mu_dynamic} must be at most mu_static {self.mu_static}"
             )
         if self.dynamic_speed_mm_s <= self.stiction_speed_mm_s:
             raise ValueError(
@@ -44,13 +44,13 @@ class FrictionCurve(Frozen):
 
 
 class JointFriction(FrictionCurve):
-    """Friction torque of a revolute joint, eq. (5); the switches of Table I are explicit here."""
+    """Friction torque of a revolute joint, eq. (5), with the on/off settings of Table I."""
 
     friction_arm_mm: NonNegative  # R_n, lever of the axial force
     pin_radius_mm: NonNegative  # R_p, lever of the radial force
     bending_arm_mm: Positive  # R_b, divides the bending moment
-    preload_Nmm: NonNegative = 0.0  # T_pre, off in Table I
-    bending: bool = True  # Table I: bending moment on
+    preload_Nmm: NonNegative = 0.0  # T_pre; off in Table I
+    bending: bool = True  # friction from the bending moment; on in Table I
 
 
 def _joint(
@@ -71,15 +71,15 @@ def _joint(
 class RobotParameters(Frozen):
     """One robot: chassis, two drive wheels, castor fork, castor wheel.
 
-    The centre of mass lies ``com_offset_mm`` behind the axle's midpoint c; the castor's pivot lies
-    ``castor_pivot_mm`` behind c and its floor contact ``castor_trail_mm`` behind the pivot.
+    The centre of mass lies ``com_offset_mm`` behind the axle midpoint c, the castor's pivot
+    ``castor_pivot_mm`` behind c, and its floor contact ``castor_trail_mm`` behind the pivot.
     Fields marked *chosen* are not in the paper.
 
     Raises
     ------
     pydantic.ValidationError
-        (a ValueError) for a value outside its range, an unknown field, or loads that do not fit the
-        place of the centre of mass.
+        (a ValueError) for a value outside its range, an unknown field, or wheel loads that contradict
+        the position of the centre of mass.
     """
 
     # Table I
@@ -103,7 +103,7 @@ class RobotParameters(Frozen):
     outline_offset_mm: FiniteFloat = 30.0  # centre of the outline's circle, behind c
     # footnote 4
     torque_limit_Nmm: Positive = 15.0
-    # Table I; the tyres' v_d is missing there: 1.5 v_s, as for the joints
+    # Table I; it does not give the tyres' v_d: 1.5 v_s, as for the joints
     tyre: FrictionCurve = FrictionCurve(
         mu_static=0.073, mu_dynamic=0.055, stiction_speed_mm_s=2.0, dynamic_speed_mm_s=3.0
     )
@@ -116,9 +116,7 @@ class RobotParameters(Frozen):
     def _check_loads(self) -> Self:
         total = 2 * self.drive_load_share + self.castor_load_share
         if abs(total - 1) > LOAD_SPLIT_TOLERANCE:
-            raise ValueError(
-                f"2·drive_load_share + castor_load_share is {total}; the three wheels carry 1"
-            )
+            raise ValueError(f"2·drive_load_share + castor_load_share is {total}; it must be 1")
         base_mm = self.castor_pivot_mm + self.castor_trail_mm
         needed_mm = self.castor_load_share * base_mm
         if abs(needed_mm - self.com_offset_mm) > LOAD_SPLIT_TOLERANCE * base_mm:
@@ -131,9 +129,9 @@ class RobotParameters(Frozen):
 
 
 class Joint(NamedTuple):
-    """Eq. (5) in kernel units, with its constant parts gathered: T_f = μ(v)·(constant + radial + bending).
+    """Eq. (5) in kernel units, with constant parts combined: T_f = μ(v)·(constant + radial + bending).
 
-    ``axial_mm`` multiplies the axial force, ``radial_mm`` the radial one, ``bending`` the bending
+    ``axial`` (mm) multiplies the axial force, ``radial`` (mm) the radial one, ``bending`` the bending
     moment; ``preload`` is in mN·mm.
     """
 
@@ -141,14 +139,14 @@ class Joint(NamedTuple):
     mu_dynamic: float
     stiction_speed: float
     dynamic_speed: float
-    axial_mm: float
-    radial_mm: float
+    axial: float
+    radial: float
     bending: float
     preload: float
 
 
 class Mass(NamedTuple):
-    """What a payload changes of a :class:`Body`: its first fields, in the same order."""
+    """The constants that a payload changes: the first fields of :class:`Body`, in the same order."""
 
     m: float
     I: float  # noqa: E741  the symbol of the equations
@@ -166,10 +164,10 @@ class Mass(NamedTuple):
 
 
 class Body(NamedTuple):
-    """One robot as the kernel reads it: mN, mm, kg, s; inverse masses computed once.
+    """Constants of one robot for the kernel, in mN, mm, kg, s; inverse masses are computed once.
 
-    Names as in ``docs/physics.md``: h half the axle width, d centre of mass behind c, q pivot behind
-    the centre of mass, T trail, subscripts e right, f forward.
+    Names as in ``docs/physics.md``: h half the axle width, d distance of the centre of mass behind c, q
+    distance of the pivot behind the centre of mass, T trail; subscripts e to the right, f forward.
     """
 
     # the fields of Mass
@@ -186,7 +184,7 @@ class Body(NamedTuple):
     inverse_m: float
     inverse_I: float
     outline_ahead: float
-    # what no payload changes
+    # not changed by a payload
     I_s: float
     J: float
     J_c: float
@@ -242,15 +240,20 @@ class Body(NamedTuple):
 def _joint_row(joint: JointFriction, *, enabled: bool) -> Joint:
     on = 1.0 if enabled else 0.0
     return Joint(
-        on * joint.mu_static,
-        on * joint.mu_dynamic,
-        joint.stiction_speed_mm_s,
-        joint.dynamic_speed_mm_s,
-        joint.friction_arm_mm,
-        joint.pin_radius_mm,
-        joint.pin_radius_mm / joint.bending_arm_mm if joint.bending else 0.0,
-        joint.preload_Nmm * MILLINEWTON_PER_NEWTON,
+        mu_static=on * joint.mu_static,
+        mu_dynamic=on * joint.mu_dynamic,
+        stiction_speed=joint.stiction_speed_mm_s,
+        dynamic_speed=joint.dynamic_speed_mm_s,
+        axial=joint.friction_arm_mm,
+        radial=joint.pin_radius_mm,
+        bending=joint.pin_radius_mm / joint.bending_arm_mm if joint.bending else 0.0,
+        preload=joint.preload_Nmm * MILLINEWTON_PER_NEWTON,
     )
+
+
+def _prefixed(prefix: str, joint: Joint) -> dict[str, float]:
+    """A joint's numbers by the names of their fields in :class:`Body`."""
+    return {f"{prefix}_{name}": value for name, value in joint._asdict().items()}
 
 
 def weighed(
@@ -265,23 +268,23 @@ def weighed(
     spin_mass: float,
     outline_behind: float,
 ) -> Mass:
-    """What follows from mass, inertia, centre of mass and each wheel's share of the weight."""
+    """Constants that follow from mass, inertia, centre of mass and each wheel's share of the weight."""
     weight = m * gravity
     inverse_m, inverse_I = 1.0 / m, 1.0 / I
     return Mass(
-        m,
-        I,
-        d,
-        pivot - d,
-        drive_share * weight,
-        castor_share * weight,
-        inverse_m + d * d * inverse_I,
-        inverse_m + h * h * inverse_I,
-        d * h * inverse_I,
-        I + m * (d * d) + 2.0 * spin_mass * (h * h),
-        inverse_m,
-        inverse_I,
-        d - outline_behind,
+        m=m,
+        I=I,
+        d=d,
+        q=pivot - d,
+        load_drive=drive_share * weight,
+        load_castor=castor_share * weight,
+        w_ee=inverse_m + d * d * inverse_I,
+        w_ff=inverse_m + h * h * inverse_I,
+        w_ef=d * h * inverse_I,
+        I_rolling=I + m * (d * d) + 2.0 * spin_mass * (h * h),
+        inverse_m=inverse_m,
+        inverse_I=inverse_I,
+        outline_ahead=d - outline_behind,
     )
 
 
@@ -290,78 +293,79 @@ compiled_weighed = law(weighed)
 
 @law
 def laden(empty: Body, mass: float, behind: float, inertia: float) -> Mass:
-    """The robot with a payload (kg, mm behind c, kg·mm² about its own centre).
+    """Constants of the robot with a payload (kg, mm behind c, kg·mm² about the payload's centre).
 
-    The wheels can carry it while the common centre of mass, ``d``, lies above their base:
-    from 0 to ``pivot + T``.
+    The wheels can carry the payload if the common centre of mass ``d`` lies above their base, between 0
+    and ``pivot + T``.
     """
     m = empty.m + mass
     d = (empty.m * empty.d + mass * behind) / m
     own, other = d - empty.d, behind - d
     castor_share = d / (empty.pivot + empty.T)
     return compiled_weighed(
-        m,
-        empty.I + empty.m * (own * own) + inertia + mass * (other * other),
-        d,
-        (1.0 - castor_share) / 2.0,
-        castor_share,
-        empty.gravity,
-        empty.pivot,
-        empty.h,
-        empty.spin_mass_drive,
-        empty.outline_behind,
+        m=m,
+        I=empty.I + empty.m * (own * own) + inertia + mass * (other * other),
+        d=d,
+        drive_share=(1.0 - castor_share) / 2.0,
+        castor_share=castor_share,
+        gravity=empty.gravity,
+        pivot=empty.pivot,
+        h=empty.h,
+        spin_mass=empty.spin_mass_drive,
+        outline_behind=empty.outline_behind,
     )
 
 
-def body(p: RobotParameters) -> Body:
+def body(robot: RobotParameters) -> Body:
     """Kernel constants of one robot."""
-    half_mm = p.axle_width_mm / 2
-    spin_mass = p.wheel_inertia_kg_mm2 / p.wheel_radius_mm**2
+    half_mm = robot.axle_width_mm / 2
+    spin_mass = robot.wheel_inertia_kg_mm2 / robot.wheel_radius_mm**2
     mass = weighed(
-        p.mass_kg,
-        p.body_inertia_kg_mm2,
-        p.com_offset_mm,
-        p.drive_load_share,
-        p.castor_load_share,
-        p.gravity_mm_s2,
-        p.castor_pivot_mm,
-        half_mm,
-        spin_mass,
-        p.outline_offset_mm,
+        m=robot.mass_kg,
+        I=robot.body_inertia_kg_mm2,
+        d=robot.com_offset_mm,
+        drive_share=robot.drive_load_share,
+        castor_share=robot.castor_load_share,
+        gravity=robot.gravity_mm_s2,
+        pivot=robot.castor_pivot_mm,
+        h=half_mm,
+        spin_mass=spin_mass,
+        outline_behind=robot.outline_offset_mm,
     )
+    on = robot.joint_friction
     return Body(
-        *mass,
-        p.fork_inertia_kg_mm2,
-        p.wheel_inertia_kg_mm2,
-        p.castor_inertia_kg_mm2,
-        p.wheel_radius_mm,
-        p.castor_radius_mm,
-        half_mm,
-        p.castor_trail_mm,
-        p.wheel_radius_mm**2 / p.wheel_inertia_kg_mm2,
-        p.castor_radius_mm**2 / p.castor_inertia_kg_mm2,
-        spin_mass,
-        p.castor_inertia_kg_mm2 / p.castor_radius_mm**2,
-        1 / p.fork_inertia_kg_mm2,
-        1 / p.wheel_inertia_kg_mm2,
-        1 / p.castor_inertia_kg_mm2,
-        p.torque_limit_Nmm * MILLINEWTON_PER_NEWTON,
-        p.outline_radius_mm,
-        p.gravity_mm_s2,
-        p.castor_pivot_mm,
-        p.outline_offset_mm,
-        p.tyre.mu_static,
-        p.tyre.mu_dynamic,
-        p.tyre.stiction_speed_mm_s,
-        p.tyre.dynamic_speed_mm_s,
-        *_joint_row(p.drive_joint, enabled=p.joint_friction),
-        *_joint_row(p.castor_joint, enabled=p.joint_friction),
-        *_joint_row(p.steering_joint, enabled=p.joint_friction),
-        p.steering_joint.pin_radius_mm,
+        **mass._asdict(),
+        I_s=robot.fork_inertia_kg_mm2,
+        J=robot.wheel_inertia_kg_mm2,
+        J_c=robot.castor_inertia_kg_mm2,
+        R=robot.wheel_radius_mm,
+        R_c=robot.castor_radius_mm,
+        h=half_mm,
+        T=robot.castor_trail_mm,
+        spin_drive=robot.wheel_radius_mm**2 / robot.wheel_inertia_kg_mm2,
+        spin_castor=robot.castor_radius_mm**2 / robot.castor_inertia_kg_mm2,
+        spin_mass_drive=spin_mass,
+        spin_mass_castor=robot.castor_inertia_kg_mm2 / robot.castor_radius_mm**2,
+        inverse_I_s=1 / robot.fork_inertia_kg_mm2,
+        inverse_J=1 / robot.wheel_inertia_kg_mm2,
+        inverse_J_c=1 / robot.castor_inertia_kg_mm2,
+        torque_limit=robot.torque_limit_Nmm * MILLINEWTON_PER_NEWTON,
+        outline_radius=robot.outline_radius_mm,
+        gravity=robot.gravity_mm_s2,
+        pivot=robot.castor_pivot_mm,
+        outline_behind=robot.outline_offset_mm,
+        mu_static=robot.tyre.mu_static,
+        mu_dynamic=robot.tyre.mu_dynamic,
+        stiction_speed=robot.tyre.stiction_speed_mm_s,
+        dynamic_speed=robot.tyre.dynamic_speed_mm_s,
+        **_prefixed("drive", _joint_row(robot.drive_joint, enabled=on)),
+        **_prefixed("axle", _joint_row(robot.castor_joint, enabled=on)),
+        **_prefixed("steer", _joint_row(robot.steering_joint, enabled=on)),
+        steer_pin=robot.steering_joint.pin_radius_mm,
     )
 
 
 def body_array(robots: list[RobotParameters], lanes: int = 1) -> np.ndarray:
-    """Constants of a formation, ``(field, robot, lane)``, every lane alike."""
-    rows = np.array([body(p) for p in robots], dtype=np.float64)
+    """Constants of a formation, ``(field, robot, lane)``, the same in every lane (formation of a batch)."""
+    rows = np.array([body(robot) for robot in robots], dtype=np.float64)
     return np.ascontiguousarray(np.repeat(rows.T[:, :, None], lanes, axis=2))

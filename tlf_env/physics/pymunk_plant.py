@@ -1,8 +1,8 @@
 """The ``pymunk`` plant: one formation in a Chipmunk space, for contact between robots.
 
-The kernel owns centre of mass, angle and velocities, and advances poses exactly as Chipmunk does, so
-Chipmunk need not run while all outlines are well apart: its step would change nothing. While robots
-are close each substep runs through the space, and only robots that a contact has moved are read back.
+The kernel computes centre of mass, angle and velocities, and advances poses exactly as Chipmunk does.
+While all outlines are well apart, a step of Chipmunk would change nothing and is left out. While robots
+are close, each substep runs through the space, and only robots that a contact has moved are read back.
 """
 
 from __future__ import annotations
@@ -31,9 +31,9 @@ class PymunkPlant:
         self.reset(body_array(robots)[:, :, 0])
 
     def reset(self, constants: np.ndarray | None = None) -> None:
-        """Rebuild the space; contacts are forgotten, and a run repeats bit for bit.
+        """Rebuild the space without contacts, so that a run repeats bit for bit.
 
-        ``constants`` (field, robot) are the kernel's of the bodies, the last ones if None.
+        ``constants`` (field, robot) are the bodies' constants of the kernel; None keeps the last ones.
         """
         if constants is not None:
             self._constants = constants.copy()
@@ -63,7 +63,7 @@ class PymunkPlant:
                 self._moved.add(self._number[shape.body])
 
     def space(self, motions: np.ndarray) -> pymunk.Space:
-        """The space with its bodies where ``motions`` (field, robot, 1) has them, for drawing and queries."""
+        """The space with its bodies at ``motions`` (field, robot, 1), for drawing and queries."""
         self._write(motions, motions)
         for body in self._bodies:
             self._space.reindex_shapes_for_body(body)
@@ -79,9 +79,9 @@ class PymunkPlant:
     def collide(self, before: np.ndarray, motions: np.ndarray, dt: float) -> None:
         """Run one substep of the space: from the poses ``before`` with the velocities of ``motions``.
 
-        ``motions`` holds the kernel's new velocities and poses; rows of robots that a contact has
-        moved are overwritten with Chipmunk's. Position correction works in the step after a contact
-        was solved, hence the second set.
+        ``motions`` contains the new velocities and poses of the kernel; for robots that a contact has
+        moved they are overwritten with those of Chipmunk. Chipmunk corrects positions in the step after
+        it has solved a contact, so the robots of the previous step are included.
         """
         self._write(before, motions)
         self._moved_before, self._moved = self._moved, set()

@@ -1,11 +1,10 @@
 """The closed form of a substep in which all three wheels roll and their axles turn.
 
-Without slip the robot has two velocities, v_f and w (one while the steering sticks); everything else
-follows from them. Gauss's principle picks them: they minimise the mass-weighted distance to the
-velocities that the bodies would have without the floor. Then the floor's impulses follow, and the
-guess is tested: impulses within their circles, every friction opposing its motion. For frozen limits
-the velocities that pass are the only ones, so the sweeps of :mod:`tlf_env.physics.sweeps` would find
-the same; where the test fails they are asked.
+Without slip the robot has two independent velocities, v_f and w (one while the steering sticks). By
+Gauss's principle they minimise the mass-weighted distance to the velocities that the bodies would have
+without the floor. The floor's impulses follow from them. Then the assumption is tested: all impulses
+within their friction circles, every friction torque opposing its motion. For constant limits the solution
+is unique, so :mod:`tlf_env.physics.sweeps` would find the same; if the test fails, the sweeps are used.
 """
 
 from __future__ import annotations
@@ -13,7 +12,7 @@ from __future__ import annotations
 import math
 
 from tlf_env.numerics.compiled import law
-from tlf_env.physics.limits import Limits
+from tlf_env.physics.friction_limits import FrictionLimits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Floor, Rates
 
@@ -26,12 +25,12 @@ def rolling(
     cos_phi: float,
     sin_phi: float,
     floor: Floor,
-    limits: Limits,
+    limits: FrictionLimits,
 ) -> tuple[bool, Rates, Contact]:
     """Velocities and impulses if all wheels roll, and whether they do.
 
-    ``free`` are the velocities with torques and pushes but without floor and friction, ``before``
-    those at the substep's start: they tell which way each friction points.
+    ``free`` are the velocities with torques and pushes but without floor and friction; ``before`` those
+    at the start of the substep, which determine the direction of each friction torque.
     """
     q_l = -math.copysign(limits.axle_l, before.omega_l)
     q_r = -math.copysign(limits.axle_r, before.omega_r)
@@ -97,7 +96,7 @@ def rolling(
     v_e = w * body.d
     along_l, along_r = v_f - w * body.h, v_f + w * body.h
     along_c = v_f * cos_phi - pivot * w * sin_phi
-    # What the tyres gave so that each wheel rolls.
+    # Impulses of the tyres that make each wheel roll.
     p_lf = m_drive * (u_l - along_l)
     p_rf = m_drive * (u_r - along_r)
     p_cy = m_castor * (u_c - along_c)
@@ -126,6 +125,20 @@ def rolling(
     )
     return (
         rolls,
-        Rates(v_e, v_f, w, s, omega_l, omega_r, omega_c),
-        Contact(p_e, p_lf, p_e, p_rf, p_cx, p_cy, q_l, q_r, q_c, q_s, 0.0, 0.0, 0.0),
+        Rates(v_e=v_e, v_f=v_f, w=w, s=s, omega_l=omega_l, omega_r=omega_r, omega_c=omega_c),
+        Contact(
+            p_le=p_e,
+            p_lf=p_lf,
+            p_re=p_e,
+            p_rf=p_rf,
+            p_cx=p_cx,
+            p_cy=p_cy,
+            q_l=q_l,
+            q_r=q_r,
+            q_c=q_c,
+            q_s=q_s,
+            slip_l=0.0,
+            slip_r=0.0,
+            slip_c=0.0,
+        ),
     )

@@ -1,10 +1,11 @@
-"""A robot's state as the kernel sees it. Units: mm, kg, s, rad; forces mN, impulses mN·s and mN·mm·s."""
+"""A robot's state in the kernel. Units: mm, kg, s, rad; forces mN, impulses mN·s and mN·mm·s."""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.rows import replacing
 from tlf_env.numerics.trig import sincos
 from tlf_env.physics.parameters import Body
 
@@ -28,7 +29,7 @@ class Motion(NamedTuple):
 
 
 class Contact(NamedTuple):
-    """The solver's memory, part of the state: last impulses, and slip speeds."""
+    """Previous impulses, from which the solver starts, and slip speeds; part of the state."""
 
     p_le: float  # tyre impulses, mN·s
     p_lf: float
@@ -58,9 +59,9 @@ class Rates(NamedTuple):
 
 
 class Floor(NamedTuple):
-    """What the floor does to one robot during one substep."""
+    """Effect of the floor on one robot in one substep."""
 
-    conveyor_l: float  # σ_l, σ_r: injected slip of eq. (14) as conveyor speeds, mm/s
+    conveyor_l: float  # σ_l, σ_r: injected slip of eq. (14) as speeds of the floor, mm/s
     conveyor_r: float
     grip_l: float  # factors on the tyres' friction
     grip_r: float
@@ -80,38 +81,30 @@ read_motion = reader(Motion)
 write_motion = writer(Motion)
 read_contact = reader(Contact)
 write_contact = writer(Contact)
+with_pose = replacing(Motion, "x", "y", "theta")
 
 
 @law
 def conveyor(delta_1: float, delta_2: float, half_width: float) -> tuple[float, float]:
-    """Conveyor speeds (left, right; mm/s) that inject the slip δ₁ (mm/s), δ₂ (rad/s) of eq. (14)."""
+    """Speeds of the floor (left, right; mm/s) that inject the slip δ₁ (mm/s), δ₂ (rad/s) of eq. (14)."""
     return delta_1 - delta_2 * half_width, delta_1 + delta_2 * half_width
 
 
 @law
 def forward_and_yaw(motion: Motion) -> tuple[float, float]:
-    """Speed along the heading (mm/s), the same for every point of the robot's axis, and yaw rate (rad/s)."""
+    """Speed along the heading (mm/s; equal for all points of the robot's axis) and yaw rate (rad/s)."""
     sin, cos = sincos(motion.theta)
     return motion.v_y * cos - motion.v_x * sin, motion.w
 
 
 @law
 def advance_pose(motion: Motion, dt: float) -> Motion:
-    """Pose one substep on, added up exactly as Chipmunk does: p + v·dt, θ + w·dt."""
-    return Motion(
-        motion.x + motion.v_x * dt,
-        motion.y + motion.v_y * dt,
-        motion.theta + motion.w * dt,
-        motion.psi,
-        motion.v_x,
-        motion.v_y,
-        motion.w,
-        motion.s,
-        motion.omega_l,
-        motion.omega_r,
-        motion.omega_c,
-        motion.angle_l,
-        motion.angle_r,
+    """The pose after one substep, computed exactly as Chipmunk does: p + v·dt, θ + w·dt."""
+    return with_pose(
+        motion,
+        x=motion.x + motion.v_x * dt,
+        y=motion.y + motion.v_y * dt,
+        theta=motion.theta + motion.w * dt,
     )
 
 

@@ -1,8 +1,8 @@
 """Impulses of floor and friction by sweeps, for every case: any wheel may slide, any joint stick.
 
-Block Gauss–Seidel on impulses over left wheel, right wheel and castor. Each block takes its own
-impulses out of the velocities, is solved exactly, and puts them back. Axes: e to the right and f
-forward in the body, ⊥ (x) and ∥ (y) in the castor's fork.
+Block Gauss–Seidel on impulses over left wheel, right wheel and castor. For each block its impulses are
+removed from the velocities, solved exactly, and added again. Axes: e to the right and f forward in the
+body; across (⊥, x) and along (∥, y) the castor's fork.
 """
 
 from __future__ import annotations
@@ -11,12 +11,14 @@ import math
 
 from tlf_env.numerics.compiled import block, law
 from tlf_env.physics.friction import disc
-from tlf_env.physics.limits import Limits
+from tlf_env.physics.friction_limits import FrictionLimits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Floor, Rates
 
 SWEEP_TOLERANCE_MM_S = 1e-9
-SWEEP_CAP = 1000  # a sticking castor at an angle can need hundreds; most substeps need few
+SWEEP_CAP = (
+    1000  # a sticking castor at an angle can need hundreds of sweeps; most substeps need few
+)
 
 
 @law
@@ -31,16 +33,16 @@ def drive_wheel(
     friction: float,
     grip: float,
 ) -> tuple[float, float, float, float, float]:
-    """Solve one drive wheel: stuck axle first, then the axle sliding.
+    """Solve one drive wheel: first with a sticking axle, then with a sliding axle.
 
-    ``side`` is +1 left, −1 right; ``friction`` the axle's largest impulse, ``grip`` the tyre's;
-    velocities and ``omega_0`` are those without this wheel's own impulses.
+    ``side`` is +1 left, −1 right; ``friction`` the largest impulse of the axle, ``grip`` that of the
+    tyre. Velocities and ``omega_0`` exclude the impulses of this wheel.
     Returns ``(p_e, p_f, q, ω, λ)``.
     """
     b_e = v_e - w * body.d
     b_f = v_f - side * w * body.h - belt
     w_ef = side * body.w_ef
-    # An axle whose spin neither friction nor tyre can stop in one substep need not be tried stuck.
+    # Skip the sticking case if friction and tyre together cannot stop the axle in one substep.
     if body.J * abs(omega_0) <= friction + body.R * grip:
         p_e, p_f, lam = disc(body.w_ee, body.w_ff, w_ef, b_e, b_f, grip)
         q = body.R * p_f - body.J * omega_0
@@ -68,9 +70,9 @@ def castor_wheel(
     friction: float,
     grip: float,
 ) -> tuple[float, float, float, float, float]:
-    """Solve the castor wheel for a given steering state; the same two trials as a drive wheel.
+    """Solve the castor wheel for a given steering state, with the same two cases as a drive wheel.
 
-    ``b`` and ``W`` are the fork point's velocity and inverse mass, the wheel's spin left out.
+    ``b`` and ``W`` are velocity and inverse mass of the fork at the contact, without the wheel's spin.
     Returns ``(p_⊥, p_∥, q_c, ω_c, λ)``.
     """
     if body.J_c * abs(omega_0) <= friction + body.R_c * grip:
@@ -100,7 +102,10 @@ def castor(
     steer_friction: float,
     grip: float,
 ) -> tuple[float, float, float, float, float, float, float, float]:
-    """Solve the castor: steering locked first, then sliding. Returns ``(p_⊥, p_∥, q_c, q_s, w, s, ω_c, λ)``."""
+    """Solve the castor: first with locked, then with sliding steering.
+
+    Returns ``(p_⊥, p_∥, q_c, q_s, w, s, ω_c, λ)``.
+    """
     I_total = body.I + body.I_s
     rate = (body.I * w + body.I_s * s) / I_total
     lever = body.q * cos_phi + body.T
@@ -147,8 +152,8 @@ def share_lateral(
 ) -> tuple[float, float]:
     """Split the drive wheels' lateral impulse equally, as far as the two friction circles allow.
 
-    While both tyres stick their lateral forces act along one line, so that only the sum is determined;
-    an arbitrary split would squeeze the joints and raise their friction.
+    While both tyres stick, their lateral forces act along one line and only the sum is determined. An
+    unequal split would load the joints against each other and increase their friction.
     """
     total = p_le + p_re
     room_l = math.sqrt(max(grip_l * grip_l - p_lf * p_lf, 0.0))
@@ -166,10 +171,9 @@ def sweep(
     cos_p: float,
     sin_p: float,
     floor: Floor,
-    limits: Limits,
+    limits: FrictionLimits,
 ) -> tuple[Rates, Contact]:
-    """Velocities and impulses of a substep; ``contact`` holds the last impulses, to start from."""
-    # Warm start with all stored impulses.
+    """Velocities and impulses of a substep; the solution starts from the impulses in ``contact``."""
     p_le, p_lf, p_re, p_rf = contact.p_le, contact.p_lf, contact.p_re, contact.p_rf
     p_cx, p_cy = contact.p_cx, contact.p_cy
     q_l, q_r, q_c, q_s = contact.q_l, contact.q_r, contact.q_c, contact.q_s
@@ -247,20 +251,20 @@ def sweep(
     slip_cx = castor_e * cos_p + v_f * sin_p + body.T * s
     slip_cy = -castor_e * sin_p + v_f * cos_p - body.R_c * omega_c
     return (
-        Rates(v_e, v_f, w, s, omega_l, omega_r, omega_c),
+        Rates(v_e=v_e, v_f=v_f, w=w, s=s, omega_l=omega_l, omega_r=omega_r, omega_c=omega_c),
         Contact(
-            p_le,
-            p_lf,
-            p_re,
-            p_rf,
-            p_cx,
-            p_cy,
-            q_l,
-            q_r,
-            q_c,
-            q_s,
-            math.sqrt(side_slip * side_slip + slip_lf * slip_lf),
-            math.sqrt(side_slip * side_slip + slip_rf * slip_rf),
-            math.sqrt(slip_cx * slip_cx + slip_cy * slip_cy),
+            p_le=p_le,
+            p_lf=p_lf,
+            p_re=p_re,
+            p_rf=p_rf,
+            p_cx=p_cx,
+            p_cy=p_cy,
+            q_l=q_l,
+            q_r=q_r,
+            q_c=q_c,
+            q_s=q_s,
+            slip_l=math.sqrt(side_slip * side_slip + slip_lf * slip_lf),
+            slip_r=math.sqrt(side_slip * side_slip + slip_rf * slip_rf),
+            slip_c=math.sqrt(slip_cx * slip_cx + slip_cy * slip_cy),
         ),
     )

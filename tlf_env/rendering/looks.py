@@ -6,6 +6,8 @@ import numpy as np
 
 Colour = tuple[int, int, int]
 
+RENDER_MODES = ("human", "rgb_array")
+
 # Okabe and Ito's colours but yellow, which is lost on white; neighbours differ in luminance too.
 FEW_COLOURS: tuple[Colour, ...] = (
     (0, 0, 0),

@@ -12,18 +12,18 @@ from typing import Any
 
 import numpy as np
 
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.rendering.drawing import BLOCK, FLOOR, INK, Place, Shapes, View, mixed
 from tlf_env.rendering.looks import (
     CASTOR_WIDTH_MM,
     DRIVE_WHEEL_WIDTH_MM,
     NOSE,
+    RENDER_MODES,
     Colour,
     robot_colours,
 )
 from tlf_env.rendering.scene import Scene
 
-RENDER_MODES = ("rgb_array", "human")
 OVERSAMPLING = 2
 DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and grow with it
 SMALLEST_PX = 64
@@ -240,7 +240,15 @@ class Renderer:
         spare = width - (high[0] - low[0]) * scale
         left = low[0] - max(spare / 2, min(spare, TABLE_PX * pen)) / scale
         top = (low[1] + high[1] + height / scale) / 2
-        return View(0, 0, width, height, (float(left), float(top)), float(scale), pen)
+        return View(
+            left=0,
+            top=0,
+            width=width,
+            height=height,
+            corner_mm=(float(left), float(top)),
+            scale=float(scale),
+            pen=pen,
+        )
 
     def _draw_background(self) -> Any:
         self._view = self._fit()
@@ -311,8 +319,8 @@ class Renderer:
         colours = [self._faded[shade] for shade in shades]
         self._shapes.lines(view, points, TRAIL_PX * view.pen * youth, colours)
 
-    def _draw_robot(self, view: View, body: Place, scene: Scene, i: int) -> None:
-        robot, colour, pen = self._robots[i], self._colours[i], view.pen
+    def _draw_robot(self, view: View, body: Place, scene: Scene, number: int) -> None:
+        robot, colour, pen = self._robots[number], self._colours[number], view.pen
         centre, half = body.at(0, -robot.outline_offset_mm), robot.axle_width_mm / 2
         radius = view.scale * robot.outline_radius_mm
         self._shapes.disc(centre, radius + 0.6 * pen, mixed(FLOOR, colour, 0.6))
@@ -322,19 +330,21 @@ class Renderer:
         )
         ahead = robot.outline_radius_mm - robot.outline_offset_mm
         self._shapes.fill(body.px((ahead * e, ahead * f) for e, f in NOSE), colour)
-        fork = body.at(0, -robot.castor_pivot_mm, scene.castor_rad[i])
+        fork = body.at(0, -robot.castor_pivot_mm, scene.castor_rad[number])
         castor = fork.at(0, -robot.castor_trail_mm)
-        self._draw_tyre(view, castor, CASTOR_WIDTH_MM, robot.castor_radius_mm, scene.slip_c_mm_s[i])
+        self._draw_tyre(
+            view, castor, CASTOR_WIDTH_MM, robot.castor_radius_mm, scene.slip_c_mm_s[number]
+        )
         for e, angle, slip in (
-            (-half, scene.wheel_angle_l_rad[i], scene.slip_l_mm_s[i]),
-            (half, scene.wheel_angle_r_rad[i], scene.slip_r_mm_s[i]),
+            (-half, scene.wheel_angle_l_rad[number], scene.slip_l_mm_s[number]),
+            (half, scene.wheel_angle_r_rad[number], scene.slip_r_mm_s[number]),
         ):
             wheel = body.at(e, 0)
             self._draw_tyre(view, wheel, DRIVE_WHEEL_WIDTH_MM, robot.wheel_radius_mm, slip)
             self._draw_treads(wheel, robot.wheel_radius_mm, angle)
-        if scene.touched[i]:
+        if scene.touched[number]:
             self._shapes.ring(centre, radius, 2.5 * pen, ALARM)
-        if scene.lost[i]:
+        if scene.lost[number]:
             self._shapes.cross(centre.at(0, 0, math.pi / 4), 0.9 * radius, 2.5 * pen, ALARM)
 
     def _draw_tyre(
@@ -360,17 +370,17 @@ class Renderer:
                 size = DRIVE_WHEEL_WIDTH_MM * wheel.scale, thickness
                 self._shapes.bar(wheel.at(0, radius_mm * math.sin(turn)), size, TREAD)
 
-    def _draw_ghost(self, view: View, body: Place, scene: Scene, i: int) -> None:
+    def _draw_ghost(self, view: View, body: Place, scene: Scene, number: int) -> None:
         """The predecessor's outline one gap ago and a tick at its front, in the follower's colour."""
-        robot, line = self._robots[i - 1], 1.3 * view.pen
+        robot, line = self._robots[number - 1], 1.3 * view.pen
         radius, offset = robot.outline_radius_mm, robot.outline_offset_mm
-        self._shapes.ring(body.at(0, -offset), radius * view.scale, line, self._colours[i])
+        self._shapes.ring(body.at(0, -offset), radius * view.scale, line, self._colours[number])
         front = body.at(0, 1.1 * radius - offset)
-        self._shapes.bar(front, (line, 0.2 * radius * view.scale), self._colours[i])
+        self._shapes.bar(front, (line, 0.2 * radius * view.scale), self._colours[number])
 
-    def _draw_reference(self, view: View, place: Place, scene: Scene, i: int) -> None:
+    def _draw_reference(self, view: View, place: Place, scene: Scene, number: int) -> None:
         """A cross, its arms along the reference's axes."""
-        arm = ARM_RADII * self._robots[i].outline_radius_mm * view.scale
+        arm = ARM_RADII * self._robots[number].outline_radius_mm * view.scale
         self._shapes.cross(place, arm, 1.2 * view.pen, INK)
 
     def _draw_arrows(self, scene: Scene) -> None:
@@ -389,18 +399,26 @@ class Renderer:
 
     # Close-up
 
-    def _close_up_view(self, i: int, scene: Scene) -> View:
-        u, robot = self._unit, self._robots[i]
+    def _close_up_view(self, number: int, scene: Scene) -> View:
+        u, robot = self._unit, self._robots[number]
         side = OVERSAMPLING * round(CLOSE_UP_PX * u)
         left = OVERSAMPLING * round(EDGE_PX * u)
         top = self._view.height - side - OVERSAMPLING * round((EDGE_PX + 3 * LINE_PX) * u)
         extent_mm = CLOSE_UP_RADII * robot.outline_radius_mm
         back_mm = robot.outline_offset_mm
-        middle_x = float(scene.x_mm[i] + back_mm * np.sin(scene.theta_rad[i]))
-        middle_y = float(scene.y_mm[i] - back_mm * np.cos(scene.theta_rad[i]))
+        middle_x = float(scene.x_mm[number] + back_mm * np.sin(scene.theta_rad[number]))
+        middle_y = float(scene.y_mm[number] - back_mm * np.cos(scene.theta_rad[number]))
         corner_mm = (middle_x - extent_mm / 2, middle_y + extent_mm / 2)
         pen = CLOSE_UP_PEN * self._view.pen
-        return View(left, top, side, side, corner_mm, side / extent_mm, pen)
+        return View(
+            left=left,
+            top=top,
+            width=side,
+            height=side,
+            corner_mm=corner_mm,
+            scale=side / extent_mm,
+            pen=pen,
+        )
 
     def _draw_close_up(self, scene: Scene) -> None:
         i = self._focus
@@ -450,14 +468,19 @@ class Renderer:
         for i in range(rows):
             self._write_robot(scene, i, top + i * LINE_PX * u)
 
-    def _write_robot(self, scene: Scene, i: int, y: float) -> None:
+    def _write_robot(self, scene: Scene, number: int, y: float) -> None:
         """One line: colour, name, position error, time-gap error, what has happened."""
         u = self._text_unit
         x = EDGE_PX * u
-        self._pg.draw.aacircle(self._picture, self._colours[i], (x + 5 * u, y + 6 * u), 5 * u)
-        gap = f"{scene.time_gap_error_s[i]:+.3f} s" if i > 0 else ""
-        flags = [name for name in ("lost", "touched") if getattr(scene, name)[i]]
-        texts = (f"robot_{i}", _length_text(scene.position_error_mm[i]), gap, ", ".join(flags))
+        self._pg.draw.aacircle(self._picture, self._colours[number], (x + 5 * u, y + 6 * u), 5 * u)
+        gap = f"{scene.time_gap_error_s[number]:+.3f} s" if number > 0 else ""
+        flags = [name for name in ("lost", "touched") if getattr(scene, name)[number]]
+        texts = (
+            f"robot_{number}",
+            _length_text(scene.position_error_mm[number]),
+            gap,
+            ", ".join(flags),
+        )
         sides = ("topleft", "topright", "topright", "topleft")
         for text, column, side in zip(texts, COLUMNS_PX, sides, strict=True):
             if not text:

@@ -3,20 +3,22 @@
 from __future__ import annotations
 
 import math
+from typing import Literal
 
 import numpy as np
 
 from tlf_env.numerics.compiled import law
 from tlf_env.onboard.limiter import braked, limited_twist, saturated
-from tlf_env.onboard.spacing import Heard, spaced_twist
+from tlf_env.onboard.spacing import Predecessor, spaced_twist
 from tlf_env.onboard.tracking import ControllerRow, tracking_twist
-from tlf_env.physics.parameters import Body
+from tlf_env.physics.vehicle import Body, wheel_speeds
 from tlf_env.task.observation import Entry, Preview, Tracking
 
 ACTION_SIZE = 2
 TWIST, WHEEL_SPEED, TORQUE, RESIDUAL = range(4)
 REFERENCE = 5  # no action of its own: the reference's twist takes its place
-ACTION_KINDS = {
+ActionKind = Literal["twist", "wheel_speed", "torque", "residual"]
+ACTION_KINDS: dict[ActionKind, int] = {
     "twist": TWIST,
     "wheel_speed": WHEEL_SPEED,
     "torque": TORQUE,
@@ -71,9 +73,9 @@ PREDECESSOR = Tracking._fields.index("predecessor_forward")
 
 
 @law
-def limited(a: float) -> float:
-    """An action's component within [−1, 1]."""
-    return min(max(a, -1.0), 1.0)
+def clipped_action(component: float) -> float:
+    """A component of an action, clipped to [−1, 1]."""
+    return min(max(component, -1.0), 1.0)
 
 
 @law
@@ -100,10 +102,10 @@ def wanted_twist(
 
 
 @law
-def heard_predecessor(observation: np.ndarray, scales: np.ndarray) -> Heard:
+def received_predecessor(observation: np.ndarray, scales: np.ndarray) -> Predecessor:
     """The predecessor as one ``tracking`` observation tells of it."""
     i = PREDECESSOR
-    return Heard(
+    return Predecessor(
         observation[i] * scales[i],
         observation[i + 1] * scales[i + 1],
         observation[i + 2] * scales[i + 2],
@@ -120,7 +122,7 @@ def twist_action(
     """The ``twist`` action that asks the wheels for a twist (mm/s, rad/s), within the limits."""
     u_1 = max(u_1, -row.limits.reverse)
     if row.spacing.distance > 0.0 and observation[IS_LEADER] * scales[IS_LEADER] < 0.5:
-        u_1, u_2 = spaced_twist(u_1, u_2, heard_predecessor(observation, scales), row.spacing)
+        u_1, u_2 = spaced_twist(u_1, u_2, received_predecessor(observation, scales), row.spacing)
     v_1, v_2 = limited_twist(
         u_1,
         u_2,
@@ -132,7 +134,7 @@ def twist_action(
         math.hypot(observation[E_1] * scales[E_1], observation[E_2] * scales[E_2]),
         row.limits,
     )
-    return limited(v_1 / FULL_SPEED_MM_S), limited(v_2 / FULL_YAW_RATE_RAD_S)
+    return clipped_action(v_1 / FULL_SPEED_MM_S), clipped_action(v_2 / FULL_YAW_RATE_RAD_S)
 
 
 @law
@@ -160,12 +162,6 @@ def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float, rea
     near = 1.0 if fade == 0.0 else error / (error + fade)
     far = squared / (reach * reach)
     return near / (1.0 + far * far)
-
-
-@law
-def wheel_speeds(forward: float, turn: float, body: Body) -> tuple[float, float]:
-    """Wheel speeds (left, right; rad/s) of a twist (mm/s, rad/s): the inverse of eq. (1)."""
-    return (forward - turn * body.h) / body.R, (forward + turn * body.h) / body.R
 
 
 @law

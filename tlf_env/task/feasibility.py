@@ -1,6 +1,6 @@
 """What a reference trajectory asks of the robots beyond what they can do, in words.
 
-The limits follow from :class:`~tlf_env.physics.parameters.RobotParameters`; ``docs/trajectories.md``
+The limits follow from :class:`~tlf_env.physics.vehicle.RobotParameters`; ``docs/trajectories.md``
 derives them. They are for warnings: a scenario that breaks them still runs.
 """
 
@@ -11,7 +11,8 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from tlf_env.physics.parameters import MILLINEWTON_PER_NEWTON, RobotParameters, body
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.vehicle import RobotParameters, body
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import OBSERVATION_LIMIT, SAMPLE_ENTRIES, SENSOR_TAIL_ENTRIES
 from tlf_env.task.trajectories import Trajectory, sample
@@ -26,9 +27,9 @@ RATE_S = 0.1  # a robot may take so long over a change of speed or of yaw rate
 TURNS_RAD_S = 0.01  # slower, the castor need not swing
 SPOT_MM = 1.0  # a turn within a sample that travels less than this is on the spot
 # What the observation `sensor` can tell before it is clipped.
-FARTHEST_FIX_MM = OBSERVATION_LIMIT * SAMPLE_ENTRIES["fix_x"].scale
-FARTHEST_START_MM = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["start_x"].scale
-LONGEST_S = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["time"].scale
+SENSOR_FIX_LIMIT_MM = OBSERVATION_LIMIT * SAMPLE_ENTRIES["fix_x"].scale
+SENSOR_START_LIMIT_MM = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["start_x"].scale
+SENSOR_TIME_LIMIT_S = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["time"].scale
 
 
 def motor_acceleration(robot: RobotParameters) -> float:
@@ -71,26 +72,26 @@ def _motor_torque(
     Forward: m_eff·u̇₁ + m·d·u₂² + castor's axle; yaw about c: I·u̇₂ − m·d·u₁·u₂ and, in a turn, all
     that the castor's steering friction resists; joints by eq. (5), u₁·u₂ at most what the tyres hold.
     """
-    b = body(robot)
+    row = body(robot)
     u_1, u_2 = np.asarray(u_1), np.asarray(u_2)
     held = grip_acceleration(robot)[0]
     lateral = np.clip(u_1 * u_2, -held, held)
-    joint = b.drive_mu_dynamic * (
-        (b.drive_axial + b.drive_bending * b.R) * b.m * np.abs(lateral) / 2
-        + b.drive_radial * b.load_drive
-        + b.drive_preload
+    joint = row.drive_mu_dynamic * (
+        (row.drive_axial + row.drive_bending * row.R) * row.m * np.abs(lateral) / 2
+        + row.drive_radial * row.load_drive
+        + row.drive_preload
     )
-    castor = b.axle_mu_dynamic * (b.axle_radial * b.load_castor + b.axle_preload) / b.R_c
-    steering = b.steer_mu_static * (
-        (b.steer_axial + b.steer_bending * b.T) * b.load_castor + b.steer_preload
+    castor = row.axle_mu_dynamic * (row.axle_radial * row.load_castor + row.axle_preload) / row.R_c
+    steering = row.steer_mu_static * (
+        (row.steer_axial + row.steer_bending * row.T) * row.load_castor + row.steer_preload
     )
-    swing = steering * (b.d + b.q + b.T) / b.T * (np.abs(u_2) > TURNS_RAD_S)
-    mass = b.m + 2 * b.spin_mass_drive + b.spin_mass_castor
-    forward = mass * np.asarray(acceleration) + b.m * b.d * u_2**2 + castor
-    yaw = b.I_rolling * np.asarray(yaw_acceleration) - b.m * b.d * lateral
+    swing = steering * (row.d + row.q + row.T) / row.T * (np.abs(u_2) > TURNS_RAD_S)
+    mass = row.m + 2 * row.spin_mass_drive + row.spin_mass_castor
+    forward = mass * np.asarray(acceleration) + row.m * row.d * u_2**2 + castor
+    yaw = row.I_rolling * np.asarray(yaw_acceleration) - row.m * row.d * lateral
     torques = [
-        joint * np.where(u_1 + side * b.h * u_2 < 0, -1.0, 1.0)
-        + b.R / 2 * (forward + (side * yaw + sign * swing) / b.h)
+        joint * np.where(u_1 + side * row.h * u_2 < 0, -1.0, 1.0)
+        + row.R / 2 * (forward + (side * yaw + sign * swing) / row.h)
         for side in (-1.0, 1.0)
         for sign in (-1.0, 1.0)
     ]
@@ -174,12 +175,12 @@ def sensor_warnings(
 
 
 def _far_starts(starts: np.ndarray) -> Iterator[str]:
-    far = np.abs(starts).max(axis=1) > FARTHEST_START_MM
+    far = np.abs(starts).max(axis=1) > SENSOR_START_LIMIT_MM
     if far.any():
         i = _first(far)
         yield (
             f"t = 0 s: robot_{i} starts at ({starts[i, 0]:.0f}, {starts[i, 1]:.0f}) mm; observation "
-            f"'sensor' clips start_x and start_y at ±{FARTHEST_START_MM:.0f} mm{_and_more(far)}"
+            f"'sensor' clips start_x and start_y at ±{SENSOR_START_LIMIT_MM:.0f} mm{_and_more(far)}"
         )
 
 
@@ -192,15 +193,15 @@ def _far_places(
     last = len(t_s) - 1 - gap_steps * np.arange(len(starts))
     driven = last >= 0
     k = np.maximum(last, 0)
-    far = driven & (np.maximum(high[k] - starts, starts - low[k]).max(axis=1) > FARTHEST_FIX_MM)
+    far = driven & (np.maximum(high[k] - starts, starts - low[k]).max(axis=1) > SENSOR_FIX_LIMIT_MM)
     if far.any():
         i = _first(far)
         apart = places - starts[i]
-        at = _first(np.abs(apart).max(axis=1) > FARTHEST_FIX_MM)
+        at = _first(np.abs(apart).max(axis=1) > SENSOR_FIX_LIMIT_MM)
         yield (
             f"{_place(t_s, reference, at)}: the reference is ({apart[at, 0]:.0f}, "
             f"{apart[at, 1]:.0f}) mm from the start of robot_{i}; observation 'sensor' clips fixes "
-            f"and messages at ±{FARTHEST_FIX_MM:.0f} mm from it{_and_more(far)}"
+            f"and messages at ±{SENSOR_FIX_LIMIT_MM:.0f} mm from it{_and_more(far)}"
         )
 
 
@@ -210,9 +211,9 @@ def _and_more(far: np.ndarray) -> str:
 
 
 def _long_horizon(horizon_s: float) -> Iterator[str]:
-    if horizon_s > LONGEST_S:
+    if horizon_s > SENSOR_TIME_LIMIT_S:
         yield (
-            f"t = {LONGEST_S:.0f} s: observation 'sensor' clips time there; the horizon is "
+            f"t = {SENSOR_TIME_LIMIT_S:.0f} s: observation 'sensor' clips time there; the horizon is "
             f"{horizon_s:g} s"
         )
 
@@ -225,9 +226,9 @@ def _times(horizon_s: float, time_gap_s: float) -> tuple[np.ndarray, int]:
     return (t_s if len(t_s) >= 2 else np.array([0.0, horizon_s])), gap_steps
 
 
-def _place(t_s: np.ndarray, reference: np.ndarray, k: int) -> str:
-    x, y = reference[k, :2]
-    return f"t = {t_s[k]:.2f} s at ({x:.0f}, {y:.0f}) mm"
+def _place(t_s: np.ndarray, reference: np.ndarray, index: int) -> str:
+    x, y = reference[index, :2]
+    return f"t = {t_s[index]:.2f} s at ({x:.0f}, {y:.0f}) mm"
 
 
 def _first(flags: np.ndarray) -> int:

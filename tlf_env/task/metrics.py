@@ -102,11 +102,11 @@ def robot_metrics(
     return out
 
 
-def track_errors(columns: Mapping[str, np.ndarray], i: int) -> tuple[np.ndarray, np.ndarray]:
-    """Error of robot ``i`` along and across its reference's heading, robot − reference, mm."""
-    d_x = columns["x_mm"][:, i] - columns["reference_x_mm"][:, i]
-    d_y = columns["y_mm"][:, i] - columns["reference_y_mm"][:, i]
-    theta = columns["reference_theta_rad"][:, i]
+def track_errors(columns: Mapping[str, np.ndarray], robot: int) -> tuple[np.ndarray, np.ndarray]:
+    """Error of robot ``robot`` along and across its reference's heading, robot − reference, mm."""
+    d_x = columns["x_mm"][:, robot] - columns["reference_x_mm"][:, robot]
+    d_y = columns["y_mm"][:, robot] - columns["reference_y_mm"][:, robot]
+    theta = columns["reference_theta_rad"][:, robot]
     sin, cos = np.sin(theta), np.cos(theta)
     return -sin * d_x + cos * d_y, cos * d_x + sin * d_y
 

@@ -37,7 +37,17 @@ REWARD_MEANINGS = {
     "touched": "1 in the step in which it first touches another",
 }
 
-DEFAULT_WEIGHTS = RewardTerms(0.0, 0.5, 0.5, 0.5, -0.02, -0.005, -0.05, -20.0, -20.0)
+DEFAULT_WEIGHTS = RewardTerms(
+    far=0.0,
+    coarse=0.5,
+    medium=0.5,
+    fine=0.5,
+    action_change=-0.02,
+    action_size=-0.005,
+    slip=-0.05,
+    lost=-20.0,
+    touched=-20.0,
+)
 
 
 @law
@@ -46,13 +56,13 @@ def reward_terms(
 ) -> RewardTerms:
     """The terms for a position error in mm, |Δa|², |a|², and a slip speed in mm/s."""
     return RewardTerms(
-        error / FAR_MM,
-        math.exp(-error / 100.0),
-        math.exp(-error / 10.0),
-        math.exp(-error / 2.0),
-        change,
-        size,
-        slip / SLIP_UNIT_MM_S,
-        1.0 if lost else 0.0,
-        1.0 if touched else 0.0,
+        far=error / FAR_MM,
+        coarse=math.exp(-error / 100.0),
+        medium=math.exp(-error / 10.0),
+        fine=math.exp(-error / 2.0),
+        action_change=change,
+        action_size=size,
+        slip=slip / SLIP_UNIT_MM_S,
+        lost=1.0 if lost else 0.0,
+        touched=1.0 if touched else 0.0,
     )

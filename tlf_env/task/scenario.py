@@ -20,34 +20,35 @@ from pydantic import (
 from pydantic_core import PydanticCustomError
 
 from tlf_env.common.errors import one_line
+from tlf_env.common.files import FILE_NAME
 from tlf_env.common.models import Frozen, NonNegative, Positive, no_switch
 from tlf_env.common.presets import is_file_name, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.estimator import EkfParameters
+from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import PART_PATTERN
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
+from tlf_env.task.actions import ActionKind
 from tlf_env.task.feasibility import disturbed, sensor_warnings, start_note, warnings_for
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
 from tlf_env.task.trajectories import Trajectory
 from tlf_env.task.waypoints import MAX_MAGNITUDE, scenario_of_waypoints
 
 MAX_ROBOTS = 1000
-BUILT_IN_ESTIMATORS = ("ekf", "ekf-slip", "truth")
 DEFAULT_CONTROL_PERIOD_S = 0.02
 DEFAULT_PREVIEW_S = (0.5, 1.0)
 SETTLE_FRACTION = 0.4
 START_MARGIN_MM = 1.0  # between outlines at the start
 DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
-NAME = re.compile(r"\w[\w.+-]{0,99}")  # a folder of results is named by it
 NOT_IN_NAMES = re.compile(r"^[^\w]+|[^\w.+-]")
 
-EndReason = Literal["lost", "touched"]
+EndCondition = Literal["lost", "touched"]
 
 
 def _part_path(value: str) -> str:
@@ -104,7 +105,7 @@ class Scenario(Frozen):
     plant: Literal["pymunk", "batch", "kinematic"] = "pymunk"
 
     wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
-    estimator: Literal["ekf", "ekf-slip", "truth"] | PartPath = "ekf"
+    estimator: EstimatorKind | PartPath = "ekf"
     ekf: EkfParameters = EkfParameters()
     ekf_slip: SlipEkfParameters = SlipEkfParameters()
     observer: ObserverParameters | PartPath = ObserverParameters()
@@ -112,7 +113,7 @@ class Scenario(Frozen):
     disturbance: Disturbance = Disturbance()
     adversary: bool = False  # whether something outside may set channels at every step
 
-    action: Literal["twist", "wheel_speed", "torque", "residual"] = "twist"
+    action: ActionKind = "twist"
     residual_base: str = "consistent"  # controller that a residual is added to, a preset
     # Estimated errors at which a residual counts half: it fades out below the first and beyond the
     # second. 0 and None: it does not.
@@ -125,7 +126,7 @@ class Scenario(Frozen):
         default_factory=lambda: FrozenDict(DEFAULT_WEIGHTS._asdict())
     )
     cooperative: bool = False  # every robot gets the formation's mean reward
-    end_on: tuple[EndReason, ...] = ("lost", "touched")
+    end_on: tuple[EndCondition, ...] = ("lost", "touched")
     lost_beyond_mm: Positive = 1200.0
 
     @model_validator(mode="before")
@@ -148,7 +149,7 @@ class Scenario(Frozen):
     @field_validator("name", mode="after")
     @classmethod
     def _names_a_folder(cls, value: str) -> str:
-        if not NAME.fullmatch(value):
+        if not FILE_NAME.fullmatch(value):
             raise ValueError(
                 f"must be 1 to 100 letters, digits and _ . + -, a letter, digit or _ first, "
                 f"got {value!r}"
@@ -270,7 +271,7 @@ class Scenario(Frozen):
         return {
             role: part
             for role, part in named.items()
-            if isinstance(part, str) and part not in BUILT_IN_ESTIMATORS
+            if isinstance(part, str) and part not in ESTIMATOR_KINDS
         }
 
     @property

@@ -234,7 +234,7 @@ class Waypoints(_Timed):
     def _check(cls, points: Any) -> tuple[Point, ...]:
         if not isinstance(points, list | tuple):
             raise ValueError(f"points must be a list of (t_s, x_mm, y_mm), got {points!r:.60}")
-        return checked_points(points, "points", lambda i: f"points[{i}]")
+        return checked_points(points, "points", lambda index: f"points[{index}]")
 
     @model_validator(mode="after")
     def _try(self) -> Self:
@@ -254,9 +254,9 @@ class Waypoints(_Timed):
         self, t_s: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The velocity; at rest, as it was when the motion ended (before any: as it will begin)."""
-        told_at = drive_through(self.points).told_at(t_s)
-        direction, rate = super().tangent(told_at, *self.derivatives(told_at)[1:])
-        return direction, np.where(told_at == t_s, rate, 0.0)
+        heading_time = drive_through(self.points).heading_time(t_s)
+        direction, rate = super().tangent(heading_time, *self.derivatives(heading_time)[1:])
+        return direction, np.where(heading_time == t_s, rate, 0.0)
 
 
 Plain = Annotated[Lissajous | Rose | Circle | Waypoints, Field(discriminator="type")]

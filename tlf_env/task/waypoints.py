@@ -57,7 +57,7 @@ def read_points(path: Path) -> tuple[Point, ...]:
     if not rows or tuple(rows[0]) != HEADER:
         found = repr(",".join(rows[0]))[:60] if rows else "an empty file"
         raise ValueError(f"{path}, line 1: the header must be {','.join(HEADER)}, got {found}")
-    return checked_points(rows[1:], str(path), lambda i: f"{path}, line {lines[i + 1]}")
+    return checked_points(rows[1:], str(path), lambda index: f"{path}, line {lines[index + 1]}")
 
 
 def checked_points(
@@ -133,7 +133,7 @@ class Drive(NamedTuple):
         out[1:, inside != t_s] = 0.0
         return np.moveaxis(out, -1, 1)
 
-    def told_at(self, t_s: np.ndarray) -> np.ndarray:
+    def heading_time(self, t_s: np.ndarray) -> np.ndarray:
         """When the heading at ``t_s`` was last told: ``t_s`` itself while it moves."""
         stretch = np.maximum(np.searchsorted(self.from_s, t_s, side="left") - 1, 0)
         return np.clip(t_s, self.first_s[stretch], self.last_s[stretch])

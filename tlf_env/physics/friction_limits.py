@@ -1,4 +1,4 @@
-"""How much impulse each tyre and each joint can give in a substep; frozen while the impulses are solved."""
+"""Largest friction impulses of tyres and joints in a substep; constant while the impulses are solved."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Floor, Motion
 
 
-class Limits(NamedTuple):
+class FrictionLimits(NamedTuple):
     """Friction circles of the tyres (mN·s) and largest friction impulses of the joints (mN·mm·s)."""
 
     grip_l: float
@@ -25,7 +25,7 @@ class Limits(NamedTuple):
 
 @law
 def grip(body: Body, load: float, factor: float, slip: float, dt: float) -> float:
-    """μN·dt of a tyre at its last slip speed (mm/s)."""
+    """Radius μN·dt of a tyre's friction circle at its last slip speed (mm/s)."""
     mu = coefficient(slip, body.mu_static, body.mu_dynamic, body.stiction_speed, body.dynamic_speed)
     return mu * load * factor * dt
 
@@ -50,7 +50,7 @@ def drive_axle(body: Body, omega: float, p_e: float, p_f: float, dt: float) -> f
 
 @law
 def castor_axle(body: Body, omega: float, p_x: float, p_y: float, dt: float) -> float:
-    """Eq. (5) for the castor wheel, read as for a drive wheel."""
+    """Eq. (5) for the castor wheel, applied as for a drive wheel."""
     mu = coefficient(
         body.R_c * omega,
         body.axle_mu_static,
@@ -85,14 +85,16 @@ def steering_axle(body: Body, phi_rate: float, p_x: float, p_y: float, dt: float
 
 
 @law
-def limits(body: Body, motion: Motion, contact: Contact, floor: Floor, dt: float) -> Limits:
-    """All limits of a substep, from the speeds at its start and the last impulses."""
-    return Limits(
-        grip(body, body.load_drive, floor.grip_l, contact.slip_l, dt),
-        grip(body, body.load_drive, floor.grip_r, contact.slip_r, dt),
-        grip(body, body.load_castor, floor.grip_c, contact.slip_c, dt),
-        drive_axle(body, motion.omega_l, contact.p_le, contact.p_lf, dt),
-        drive_axle(body, motion.omega_r, contact.p_re, contact.p_rf, dt),
-        castor_axle(body, motion.omega_c, contact.p_cx, contact.p_cy, dt),
-        steering_axle(body, motion.s - motion.w, contact.p_cx, contact.p_cy, dt),
+def friction_limits(
+    body: Body, motion: Motion, contact: Contact, floor: Floor, dt: float
+) -> FrictionLimits:
+    """All limits of a substep, from the speeds at its start and the previous impulses."""
+    return FrictionLimits(
+        grip_l=grip(body, body.load_drive, floor.grip_l, contact.slip_l, dt),
+        grip_r=grip(body, body.load_drive, floor.grip_r, contact.slip_r, dt),
+        grip_c=grip(body, body.load_castor, floor.grip_c, contact.slip_c, dt),
+        axle_l=drive_axle(body, motion.omega_l, contact.p_le, contact.p_lf, dt),
+        axle_r=drive_axle(body, motion.omega_r, contact.p_re, contact.p_rf, dt),
+        axle_c=castor_axle(body, motion.omega_c, contact.p_cx, contact.p_cy, dt),
+        steering=steering_axle(body, motion.s - motion.w, contact.p_cx, contact.p_cy, dt),
     )

@@ -1,0 +1,11 @@
+"""The built-in estimators: their names in scenarios and files, and their codes in the compiled laws."""
+
+from __future__ import annotations
+
+from typing import Literal, get_args
+
+EstimatorKind = Literal["ekf", "ekf-slip", "truth"]
+ESTIMATOR_KINDS: tuple[EstimatorKind, ...] = get_args(EstimatorKind)
+
+EKF, TRUTH, EXTERNAL, EKF_SLIP = range(4)  # EXTERNAL: a Python object
+ESTIMATOR_CODES: dict[str, int] = {"ekf": EKF, "ekf-slip": EKF_SLIP, "truth": TRUTH}
