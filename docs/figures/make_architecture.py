@@ -58,22 +58,23 @@ def file_lists() -> str:
     return "\n\n".join(parts)
 
 
-def room_graph(graph: grimp.ImportGraph) -> str:
-    """The imports between rooms as a diagram; an arrow points to what is imported."""
-    arrows = {
+def room_table(graph: grimp.ImportGraph) -> str:
+    """Which room imports which, as a table: a row is the importer."""
+    imports = {
         (room_of(importer), room_of(imported))
         for importer in graph.modules
         for imported in graph.find_modules_directly_imported_by(importer)
     }
-    kept = [
-        (upper, lower)
-        for upper in ROOMS
-        for lower in ROOMS
-        if upper != lower and (upper, lower) in arrows
-    ]
     short = {room: room.removeprefix("tlf_env.") for room in ROOMS}
-    lines = ["flowchart TD", *(f"  {short[upper]} --> {short[lower]}" for upper, lower in kept)]
-    return "```mermaid\n" + "\n".join(lines) + "\n```"
+    lower = ROOMS[1:]
+    lines = [
+        "| imports | " + " | ".join(f"`{short[room]}`" for room in lower) + " |",
+        "|---" * (len(lower) + 1) + "|",
+    ]
+    for room in ROOMS[:-1]:
+        marks = ("●" if (room, other) in imports else "" for other in lower)
+        lines.append(f"| **`{short[room]}`** | " + " | ".join(marks) + " |")
+    return "\n".join(lines)
 
 
 def levels(graph: grimp.ImportGraph, room: str) -> list[list[str]]:
@@ -103,7 +104,7 @@ def page(text: str) -> str:
     """The page with its generated parts made anew."""
     graph = grimp.build_graph("tlf_env", "baselines", exclude_type_checking_imports=True)
     parts = {
-        "rooms": room_graph(graph),
+        "rooms": room_table(graph),
         "files": file_lists(),
         "levels": engine_levels(graph),
     }
