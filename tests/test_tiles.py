@@ -15,7 +15,7 @@ from tlf_env.engine.formation import reference_table
 from tlf_env.engine.layout import Draw, Order, Sample, array_reader, array_writer
 from tlf_env.engine.sensors import disturbed_encoders, sense_robot
 from tlf_env.engine.settings import Settings, make_settings
-from tlf_env.engine.substeps import asked_torques, floor_under, trace_drive, undisturbed
+from tlf_env.engine.substeps import commanded_torques, floor_under, trace_drive, undisturbed
 from tlf_env.engine.tiles import WIDTH, advance
 from tlf_env.numerics.compiled import driver, reader, writer
 from tlf_env.physics.kernel import substep
@@ -143,18 +143,18 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                         evaluate(a, lane, r, channel, tick, s)
                 effects = read_effects(a.applied, r, lane)
                 sensors = read_sensors(a.states, r, lane)
-                asked_l, asked_r, held = asked_torques(
+                commanded_l, commanded_r, held = commanded_torques(
                     body, loop, order, read_loop_state(a.states, r, lane), sensors, k
                 )
-                drive = undisturbed(asked_l, asked_r, effects)
+                drive = undisturbed(commanded_l, commanded_r, effects)
                 motion, contact = substep(
                     body,
                     read_motion(a.states, r, lane),
                     read_contact(a.states, r, lane),
                     floor_under(body, effects, drive),
                     push,
-                    drive.given_l,
-                    drive.given_r,
+                    drive.delivered_l,
+                    drive.delivered_r,
                     s.dt,
                 )
                 trace = trace_drive(

@@ -1,4 +1,4 @@
-"""What disturbs the robots, and how much: a signal per channel, friction patches, and one level.
+"""The disturbance of a scenario: a signal per channel, friction patches, and one level.
 
 The level multiplies each channel's deviation from nominal; at 0 a run is the nominal run, bit for bit.
 Nominal is the paper's: noise of the position fixes of 0.2 mm² variance and nothing else.
@@ -87,7 +87,7 @@ class RadioChannels(Frozen):
 
 
 class PayloadChannels(Frozen):
-    """Something on the chassis that the controllers do not know of."""
+    """A load on the chassis, which the controllers do not take into account."""
 
     mass_kg: ChannelSignal = _nominal("payload.mass_kg")
     behind_mm: ChannelSignal = _nominal("payload.behind_mm")

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from tlf_env.disturbances.channels import CHANNELS, Channel
 
-# Endings of a name, the longest first, and the unit that each stands for.
+# Endings of a name, the longest first, and their units.
 UNITS = {
     "_kg_mm2": "kg·mm²",
     "_rad_s": "rad/s",

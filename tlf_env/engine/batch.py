@@ -1,4 +1,4 @@
-"""Many formations at once, one compiled call a step: no contact between robots, no Python between them."""
+"""Many formations at once, one compiled call a step, without contact between robots."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ MAY_DIFFER = ("name", "robots", "robot", "wheel_loop", "ekf", "ekf_slip", "distu
 
 
 class BatchPlant:
-    """Formations side by side, as many as memory holds.
+    """Formations that are simulated side by side.
 
     Formation k seeded s is, bit for bit, the single environment seeded s + k on the plant ``batch``,
     and on ``pymunk`` until two outlines meet: here they pass through each other, and the robots are
@@ -81,7 +81,7 @@ class BatchPlant:
 
     @property
     def scenario(self) -> Scenario:
-        """The first scenario; in all but :data:`MAY_DIFFER` it speaks for the others."""
+        """The first scenario; the others differ from it in :data:`MAY_DIFFER` only."""
         return self.scenarios[0]
 
     def reset(
@@ -131,11 +131,11 @@ class BatchPlant:
         drivers.look(arrays, chosen, True, self._settings)
 
     def excerpt(self, robot: int) -> Excerpt:
-        """Room for what there is to tell of one robot in each formation, not yet written."""
+        """Memory for the results of one robot in each formation, not yet written."""
         return empty_excerpt(self.arrays, robot, self.formations)
 
     def write_excerpt(self, out: Excerpt, mask: np.ndarray | None = None) -> None:
-        """Write what there is to tell of the formations of the mask; all if None."""
+        """Write the results of the formations of the mask; all if None."""
         drivers.excerpt_of(self.arrays, self._checked_mask(mask), out)
 
     def reset_finished(self) -> np.ndarray:
@@ -148,14 +148,14 @@ class BatchPlant:
     def step(self, actions: np.ndarray, excerpt: Excerpt | None = None) -> None:
         """Advance all formations by one control period.
 
-        A formation whose episode has ended goes on if it is not reset, up to its horizon.
+        A formation whose episode has ended continues up to its horizon if it is not reset.
 
         Parameters
         ----------
         actions
             ``(formations, robots, 2)``.
         excerpt
-            Where to write what there is to tell of one robot in each formation, if anywhere.
+            Where to write the results of one robot in each formation, if given.
 
         Raises
         ------
@@ -251,17 +251,17 @@ class BatchPlant:
 
     @property
     def terminated(self) -> np.ndarray:
-        """(formations, robots) bool: who ended the episode in this step, as ``end_on`` says."""
+        """(formations, robots) bool: robots that ended the episode in this step, by ``end_on``."""
         return judging.terminated(self.arrays.ends)
 
     @property
     def truncated(self) -> np.ndarray:
-        """(formations, robots) bool: whose episode another robot or the horizon ended in this step."""
+        """(formations, robots) bool: robots whose episode another robot or the horizon ended in this step."""
         return judging.truncated(self.arrays.ends)
 
     @property
     def ended(self) -> np.ndarray:
-        """(formations,) bool: whose episode ended in this step."""
+        """(formations,) bool: formations whose episode ended in this step."""
         return (self.arrays.ends != 0).any(axis=1)
 
     @property

@@ -1,4 +1,4 @@
-"""The step drivers: what Python calls, a control step or a part of one at a time.
+"""The step drivers: functions that Python calls for a control step or a part of one.
 
 One control step runs, for every robot and substep, wheel loop → torques → disturbances → plant →
 sensors → EKF, and then once per robot radio → observer → observation, reward, errors. Robots do not
@@ -58,13 +58,13 @@ from tlf_env.task.info import RUNNING
 TRACE = in_array("trace")
 TRACE_END = TRACE + len(Trace._fields)
 DONE, MUST_COLLIDE, MUST_SUBSTEP = -1, -2, -3
-LANES_AT_ONCE = 16  # whose arrays stay in the processor's cache during a step
-SHARES = 4  # of what is left, divided by the threads: how much a thread takes at a time
+LANES_AT_ONCE = 16  # few enough that their numbers stay in the processor's cache during a step
+SHARES = 4  # a thread takes the remaining lanes / (threads · SHARES) at a time
 
 
 @law
 def command(arrays: Arrays, lane: int, robot: int, settings: Settings) -> tuple[float, float]:
-    """What robot ``r``'s clipped action asks for: wheel speeds (rad/s), or torques (mN·mm)."""
+    """The command of a robot's clipped action: wheel speeds (rad/s), or torques (mN·mm)."""
     a_0, a_1 = arrays.actions[lane, robot, 0], arrays.actions[lane, robot, 1]
     kind = arrays.kinds[robot, lane]
     if kind == TORQUE:
@@ -136,7 +136,7 @@ def take_all_actions(arrays: Arrays, first: int, last: int, settings: Settings) 
 
 @law
 def transmit_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
-    """Count the control step; everybody broadcasts."""
+    """Count the control step, and broadcast from all robots."""
     step = arrays.clock[lane, 1] + 1
     arrays.clock[lane, 1] = step
     for robot in range(arrays.states.shape[1]):
@@ -146,7 +146,7 @@ def transmit_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
 
 @law
 def look_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
-    """Errors, rewards and observations of a lane as it stands."""
+    """Errors, rewards and observations of a lane at the present step."""
     robots = arrays.states.shape[1]
     step = arrays.clock[lane, 1]
     for robot in range(robots):
@@ -221,7 +221,7 @@ def start(
 
 @driver
 def look(arrays: Arrays, mask: np.ndarray, at_start: bool, settings: Settings) -> None:
-    """:func:`look_lane` of the lanes of the mask; who starts lost is lost in the first step."""
+    """:func:`look_lane` of the lanes of the mask; a robot that starts lost counts as lost in the first step."""
     for lane in range(mask.shape[0]):
         if mask[lane]:
             look_all(arrays, lane, lane + 1, settings)
@@ -258,13 +258,13 @@ def find_near(arrays: Arrays, first: int, last: int, near: np.ndarray, settings:
 
 @driver
 def actuate(arrays: Arrays, lane: int, substep: int, settings: Settings) -> None:
-    """The first half of substep ``k`` of a lane: everything up to the plant's new velocities and poses."""
+    """The first half of a substep of a lane: everything up to the plant's new velocities and poses."""
     advance(arrays, np.full(1, lane), substep, substep + 1, True, False, settings)
 
 
 @driver
 def sense(arrays: Arrays, lane: int, substep: int, settings: Settings) -> None:
-    """The second half of substep ``k`` of a lane: sensors and estimator, and which outlines meet."""
+    """The second half of a substep of a lane: sensors and estimator, and which outlines meet."""
     advance(arrays, np.full(1, lane), substep, substep + 1, False, True, settings)
     mark_touched(arrays, lane)
 
@@ -283,7 +283,7 @@ def lanes_to_step(first: int, last: int, threads: int = 1) -> np.ndarray:
 
 @law
 def take_lanes(left: np.ndarray) -> tuple[int, int]:
-    """Some lanes that no other thread takes: many at first, few in the end, so that all end together."""
+    """Lanes for this thread alone: many at first, few in the end, so that all threads end together."""
     share = (left[1] - left[0]) // (SHARES * left[2])
     count = LANES_AT_ONCE * max(1, share // LANES_AT_ONCE)
     begin = fetch_add(left, count)

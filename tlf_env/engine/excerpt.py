@@ -1,4 +1,4 @@
-"""What an interface shows of one robot in each formation, as rows over the formations."""
+"""The results of one robot in each formation, as rows over the formations, for the vector environment."""
 
 from __future__ import annotations
 
@@ -14,17 +14,18 @@ from tlf_env.task.reward import RewardTerms
 
 
 class Excerpt(NamedTuple):
-    """Written while the lane's numbers are in the cache of the thread that made them."""
+    """Written by the thread that steps a lane, while the lane's numbers are in its cache."""
 
     robot: int
     numbers: np.ndarray  # (row, lane): Info, RewardTerms, the channels, reward, lost, touched, end
     observations: np.ndarray  # (lane, entry); (0, entry) if nothing is to be written
 
 
-TERMS = len(Info._fields)
-APPLIED = TERMS + len(RewardTerms._fields)
-REWARD = APPLIED + len(CHANNELS)
-LOST, TOUCHED, END, ROWS = range(REWARD + 1, REWARD + 5)
+# First rows: infos from 0, then the reward terms, the channels, and single rows.
+TERMS_ROW = len(Info._fields)
+APPLIED_ROW = TERMS_ROW + len(RewardTerms._fields)
+REWARD_ROW = APPLIED_ROW + len(CHANNELS)
+LOST_ROW, TOUCHED_ROW, END_ROW, ROWS = range(REWARD_ROW + 1, REWARD_ROW + 5)
 
 
 def empty_excerpt(arrays: Arrays, robot: int, lanes: int) -> Excerpt:
@@ -53,14 +54,14 @@ def write_excerpt(arrays: Arrays, first: int, last: int, out: Excerpt) -> None:
                 else arrays.observations[lane, robot, i]
             )
             out.observations[lane, i] = seen
-        for i in range(TERMS):
+        for i in range(TERMS_ROW):
             numbers[i, lane] = arrays.infos[lane, robot, i]
-        for i in range(APPLIED - TERMS):
-            numbers[TERMS + i, lane] = arrays.terms[lane, robot, i]
-        numbers[REWARD, lane] = arrays.rewards[lane, robot]
-        numbers[LOST, lane] = arrays.lost[lane, robot]
-        numbers[TOUCHED, lane] = arrays.touched[lane, robot]
-        numbers[END, lane] = arrays.ends[lane, robot]
-    for i in range(REWARD - APPLIED):
+        for i in range(APPLIED_ROW - TERMS_ROW):
+            numbers[TERMS_ROW + i, lane] = arrays.terms[lane, robot, i]
+        numbers[REWARD_ROW, lane] = arrays.rewards[lane, robot]
+        numbers[LOST_ROW, lane] = arrays.lost[lane, robot]
+        numbers[TOUCHED_ROW, lane] = arrays.touched[lane, robot]
+        numbers[END_ROW, lane] = arrays.ends[lane, robot]
+    for i in range(REWARD_ROW - APPLIED_ROW):
         for lane in range(first, last):
-            numbers[APPLIED + i, lane] = arrays.applied[i, robot, lane]
+            numbers[APPLIED_ROW + i, lane] = arrays.applied[i, robot, lane]

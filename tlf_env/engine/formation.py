@@ -1,4 +1,4 @@
-"""One episode of one or more formations: plant, onboard stack and task, advanced one control step at a time."""
+"""One formation: plant, on-board stack and task, advanced one control step at a time."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def reference_table(scenario: Scenario, phase_s: float = 0.0) -> np.ndarray:
     return sample(scenario.trajectory, phase_s + np.arange(steps) * scenario.control_period_s)
 
 
-# What each entry of State is divided by in the interface.
+# Each entry of State is divided by its scale in the interface.
 STATE_SCALES = np.array(
     [1000.0, 1000.0, 1.0, 1.0, 1.0, 500.0, 500.0, 2.0, 10.0, 10.0, 1000.0, 1000.0]
 )
@@ -52,8 +52,8 @@ class Formation:
     """State of one formation on any plant.
 
     Units: mm, s, rad; arrays are views that the next step overwrites. ``parts`` gives factories for
-    the ``estimator``, ``wheel_loop`` or ``observer`` that the scenario names, where they are at hand
-    as objects; the rest is imported by name.
+    the ``estimator``, ``wheel_loop`` or ``observer`` that the scenario names, if they are given
+    as objects; the others are imported by name.
     """
 
     def __init__(self, scenario: Scenario, parts: Mapping[str, Factory] | None = None) -> None:

@@ -54,8 +54,8 @@ def observe_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Se
         command_1, command_2 = odometry(wanted.left, wanted.right, body.R, body.h)
     before = Preview(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if robot > 0:
-        heard = latest_message(arrays, lane, robot, step, settings)
-        before = preview_entries(heard, estimate.x, estimate.y, estimate.theta)
+        received = latest_message(arrays, lane, robot, step, settings)
+        before = preview_entries(received, estimate.x, estimate.y, estimate.theta)
     slip = read_slip(arrays.states, robot, lane)
     is_leader = 1.0 if robot == 0 else 0.0
     is_last = 1.0 if robot == robots - 1 else 0.0
@@ -117,22 +117,22 @@ def observe_sensors(arrays: Arrays, lane: int, robot: int, step: int, settings: 
             out[i] = scaled(value, arrays.sensor_scales[i])
             i += 1
     if robot == 0:
-        heard = read_reference(arrays, lane, robot, step)
+        received = read_reference(arrays, lane, robot, step)
     else:
         delayed = delayed_message(arrays, lane, robot, step, settings)
-        heard = Reference(delayed.x, delayed.y, delayed.theta, delayed.u_1, delayed.u_2)
+        received = Reference(delayed.x, delayed.y, delayed.theta, delayed.u_1, delayed.u_2)
     tail = SensorTail(
         time=step * settings.period,
         start_x=start_x,
         start_y=start_y,
         start_sin=math.sin(start),
         start_cos=math.cos(start),
-        message_x=heard.x - start_x,
-        message_y=heard.y - start_y,
-        message_sin=math.sin(heard.theta),
-        message_cos=math.cos(heard.theta),
-        message_u_1=heard.u_1,
-        message_u_2=heard.u_2,
+        message_x=received.x - start_x,
+        message_y=received.y - start_y,
+        message_sin=math.sin(received.theta),
+        message_cos=math.cos(received.theta),
+        message_u_1=received.u_1,
+        message_u_2=received.u_2,
         is_leader=1.0 if robot == 0 else 0.0,
     )
     for j in range(len(tail)):

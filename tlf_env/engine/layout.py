@@ -1,6 +1,6 @@
-"""One table of everything that the engine keeps of a robot; where it lies in memory follows from it.
+"""One table of everything that the engine keeps of a robot; its places in memory follow from it.
 
-A *row* is a named tuple of numbers, one of it for each robot. The rows of one kind lie in one array,
+A *row* is a named tuple of numbers of each robot. The rows of one kind lie in one array,
 ``(field, robot, lane)``, one after the other; a lane is one formation. A *tile* (see
 :mod:`tlf_env.engine.tiles`) holds the rows of a few robots in the same order. Copying into a tile and
 back, clearing a lane at the start of an episode and taking over a scenario's constants therefore work
@@ -90,10 +90,10 @@ class Order(NamedTuple):
 class Traction(NamedTuple):
     """Torques of one substep (mN·mm), and the factors on the tyres' friction."""
 
-    asked_l: float  # by the wheel loop or the action, within the motor's limit
-    asked_r: float
-    given_l: float  # delivered
-    given_r: float
+    commanded_l: float  # by the wheel loop or the action, within the motor's limit
+    commanded_r: float
+    delivered_l: float  # delivered
+    delivered_r: float
     grip_l: float
     grip_r: float
     grip_c: float
@@ -128,11 +128,11 @@ class Column(NamedTuple):
 
 
 class Kind(Enum):
-    """How long a row lives, and where."""
+    """How long the numbers of a row are kept, and in which memory."""
 
     CONSTANT = "constant"  # copied from the scenario when an episode starts; read in every substep
     STATE = "state"  # changes in every substep; zero when an episode starts
-    CONTROL = "control"  # changes once per control step, so tiles leave it out; zero likewise
+    CONTROL = "control"  # changes once per control step, so it is not in tiles; zero when an episode starts
     SCRATCH = "scratch"  # of one substep or one control step; in tiles only
 
 

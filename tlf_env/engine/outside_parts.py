@@ -1,4 +1,4 @@
-"""Where the user's parts meet the arrays: called in Python, between the halves of each substep."""
+"""Estimators, wheel loops and observers written in Python, called between the halves of each substep."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ FIXES = [Sample._fields.index("fix_x"), Sample._fields.index("fix_y")]
 
 
 def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[str, Factory]:
-    """Factories of the parts that a scenario names; those not ``at_hand`` are imported.
+    """Factories of the parts that a scenario names; those not in ``at_hand`` are imported.
 
     Raises
     ------

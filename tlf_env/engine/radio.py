@@ -73,7 +73,7 @@ def lateness(
 
 
 @law
-def heard_message(
+def received_message(
     arrays: Arrays, lane: int, robot: int, step: int, late: int, settings: Settings
 ) -> Message:
     """The predecessor at a control step, by dead reckoning from a message ``late`` periods older."""
@@ -95,14 +95,14 @@ def delayed_message(
     passed, it is the predecessor's start pose, at rest.
     """
     late, _ = lateness(arrays, lane, robot, step, settings)
-    return heard_message(arrays, lane, robot, step - settings.gap, late, settings)
+    return received_message(arrays, lane, robot, step - settings.gap, late, settings)
 
 
 @law
 def latest_message(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> Message:
     """A robot's message at a control step about its predecessor now; jitter as above."""
     _, late = lateness(arrays, lane, robot, step, settings)
-    return heard_message(arrays, lane, robot, step, late, settings)
+    return received_message(arrays, lane, robot, step, late, settings)
 
 
 @law

@@ -77,7 +77,7 @@ def disturbed_encoders(motion: Motion, effects: Effects, draw: Draw) -> Reading:
 
 
 @law
-def asked_increments(
+def commanded_increments(
     order: Order, body: Body, slip: SlipEstimate, substep: int, dt: float
 ) -> tuple[float, float]:
     """Commanded distance (mm) and turn (rad) of the wheels in a substep; the last ones with torques."""
@@ -120,8 +120,10 @@ def sense_robot(
     if kind == EKF:
         estimate, d_x, d_y, nis = correct(predict(estimate, ekf, u_1, u_2), ekf, x, y)
     elif kind == EKF_SLIP:
-        asked_1, asked_2 = asked_increments(order, body, slip, substep, dt)
-        estimate, slip = predict_with_slip(estimate, slip, slip_ekf, u_1, u_2, asked_1, asked_2, dt)
+        commanded_1, commanded_2 = commanded_increments(order, body, slip, substep, dt)
+        estimate, slip = predict_with_slip(
+            estimate, slip, slip_ekf, u_1, u_2, commanded_1, commanded_2, dt
+        )
         estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y)
     elif kind == TRUTH:
         ahead, yaw = forward_and_yaw(motion)

@@ -1,4 +1,4 @@
-"""What the drivers know of a scenario, as plain numbers."""
+"""A scenario's numbers as the compiled drivers take them."""
 
 from __future__ import annotations
 

@@ -21,7 +21,7 @@ EXTERNAL_TORQUE = (
 with_drive_sums = replacing(
     Trace, "torque_l", "torque_r", "saturated", "slip", "slid", "torque_2", "work"
 )
-with_delivered = replacing(Traction, "given_l", "given_r")
+with_delivered = replacing(Traction, "delivered_l", "delivered_r")
 with_grip = replacing(Traction, "grip_l", "grip_r", "grip_c")
 
 
@@ -36,7 +36,7 @@ def wanted(order: Order, substep: int) -> tuple[float, float]:
 
 
 @law
-def asked_torques(
+def commanded_torques(
     body: Body,
     loop: WheelLoopRow,
     order: Order,
@@ -59,13 +59,13 @@ def asked_torques(
 
 
 @law
-def undisturbed(asked_l: float, asked_r: float, effects: Effects) -> Traction:
+def undisturbed(commanded_l: float, commanded_r: float, effects: Effects) -> Traction:
     """Torques delivered without dead time, on a floor without patches."""
     return Traction(
-        asked_l=asked_l,
-        asked_r=asked_r,
-        given_l=asked_l * effects.actuator_torque_gain_l,
-        given_r=asked_r * effects.actuator_torque_gain_r,
+        commanded_l=commanded_l,
+        commanded_r=commanded_r,
+        delivered_l=commanded_l * effects.actuator_torque_gain_l,
+        delivered_r=commanded_r * effects.actuator_torque_gain_r,
         grip_l=effects.tyre_friction_scale,
         grip_r=effects.tyre_friction_scale,
         grip_c=effects.tyre_friction_scale,
@@ -84,15 +84,16 @@ def trace_drive(
     trace: Trace, limit: float, traction: Traction, motion: Motion, contact: Contact, dt: float
 ) -> Trace:
     """Sums and extremes of torque and slip, one substep on."""
-    at_limit = abs(traction.asked_l) >= limit or abs(traction.asked_r) >= limit
-    given_l, given_r = traction.given_l, traction.given_r
+    at_limit = abs(traction.commanded_l) >= limit or abs(traction.commanded_r) >= limit
+    delivered_l, delivered_r = traction.delivered_l, traction.delivered_r
     return with_drive_sums(
         trace,
-        trace.torque_l + given_l,
-        trace.torque_r + given_r,
+        trace.torque_l + delivered_l,
+        trace.torque_r + delivered_r,
         trace.saturated + (1.0 if at_limit else 0.0),
         max(trace.slip, max(contact.slip_l, contact.slip_r)),
         trace.slid + 0.5 * (contact.slip_l + contact.slip_r) * dt,
-        trace.torque_2 + given_l * given_l + given_r * given_r,
-        trace.work + (max(given_l * motion.omega_l, 0.0) + max(given_r * motion.omega_r, 0.0)) * dt,
+        trace.torque_2 + delivered_l * delivered_l + delivered_r * delivered_r,
+        trace.work
+        + (max(delivered_l * motion.omega_l, 0.0) + max(delivered_r * motion.omega_r, 0.0)) * dt,
     )

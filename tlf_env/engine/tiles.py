@@ -42,7 +42,7 @@ from tlf_env.engine.sensors import (
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.substeps import (
     EXTERNAL_TORQUE,
-    asked_torques,
+    commanded_torques,
     floor_under,
     trace_drive,
     undisturbed,
@@ -183,13 +183,16 @@ def delay_torques(torques: np.ndarray, tile: np.ndarray, count: int) -> None:
         traction, effects = traction_of(tile, i), effects_of(tile, i)
         tick, dead = draw.tick + 1, int(order_of(tile, i).dead)
         ring = torques[:, :, draw.robot, column % lanes]
-        ring[0, tick % slots], ring[1, tick % slots] = traction.asked_l, traction.asked_r
-        given_l = given_r = 0.0
+        ring[0, tick % slots], ring[1, tick % slots] = traction.commanded_l, traction.commanded_r
+        delivered_l = delivered_r = 0.0
         if tick > dead:
-            given_l, given_r = ring[0, (tick - dead) % slots], ring[1, (tick - dead) % slots]
-        given_l *= effects.actuator_torque_gain_l
-        given_r *= effects.actuator_torque_gain_r
-        set_traction(tile, i, with_delivered(traction, given_l, given_r))
+            delivered_l, delivered_r = (
+                ring[0, (tick - dead) % slots],
+                ring[1, (tick - dead) % slots],
+            )
+        delivered_l *= effects.actuator_torque_gain_l
+        delivered_r *= effects.actuator_torque_gain_r
+        set_traction(tile, i, with_delivered(traction, delivered_l, delivered_r))
 
 
 @block
@@ -233,7 +236,7 @@ def follow(tile: np.ndarray, substep: int, dt: float) -> None:
 def ask(tile: np.ndarray, substep: int) -> None:
     """Wheel loops, up to the torques."""
     for i in range(WIDTH):
-        asked_l, asked_r, held = asked_torques(
+        commanded_l, commanded_r, held = commanded_torques(
             body_of(tile, i),
             loop_of(tile, i),
             order_of(tile, i),
@@ -242,7 +245,7 @@ def ask(tile: np.ndarray, substep: int) -> None:
             substep,
         )
         set_held(tile, i, held)
-        set_traction(tile, i, undisturbed(asked_l, asked_r, effects_of(tile, i)))
+        set_traction(tile, i, undisturbed(commanded_l, commanded_r, effects_of(tile, i)))
 
 
 @law
@@ -256,8 +259,8 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
             contact_of(tile, i),
             floor_under(body, effects_of(tile, i), traction),
             NO_PUSH,
-            traction.given_l,
-            traction.given_r,
+            traction.delivered_l,
+            traction.delivered_r,
             dt,
         )
         set_moved(tile, i, motion)
@@ -272,8 +275,8 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
                 contact_of(tile, i),
                 floor_under(body, effects_of(tile, i), traction),
                 NO_PUSH,
-                traction.given_l,
-                traction.given_r,
+                traction.delivered_l,
+                traction.delivered_r,
                 dt,
             )
             set_moved(tile, i, motion)

@@ -14,7 +14,15 @@ from gymnasium.vector.utils import batch_space
 from tlf_env.disturbances.channels import PATHS
 from tlf_env.engine import judging
 from tlf_env.engine.batch import BatchPlant
-from tlf_env.engine.excerpt import APPLIED, END, LOST, REWARD, TERMS, TOUCHED, Excerpt
+from tlf_env.engine.excerpt import (
+    APPLIED_ROW,
+    END_ROW,
+    LOST_ROW,
+    REWARD_ROW,
+    TERMS_ROW,
+    TOUCHED_ROW,
+    Excerpt,
+)
 from tlf_env.envs.parallel import start_options
 from tlf_env.envs.single import BY_REFERENCE
 from tlf_env.onboard.parts import real_numbers
@@ -194,7 +202,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         begun = self._over
         seen = self.plant.excerpt(self._robot)
         self.plant.step(self._actions, seen)
-        rewards = seen.numbers[REWARD, : self.num_envs]
+        rewards = seen.numbers[REWARD_ROW, : self.num_envs]
         if begun.any():  # they have been started, and stand at their start again
             self.plant.restart(begun)
             self.plant.write_excerpt(seen, begun)
@@ -229,7 +237,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return seen, fresh
 
     def _ends(self, seen: Excerpt) -> np.ndarray:
-        return seen.numbers[END, : self.num_envs].astype(np.int8)
+        return seen.numbers[END_ROW, : self.num_envs].astype(np.int8)
 
     def _infos(self, seen: Excerpt) -> dict[str, Any]:
         """Gymnasium's form: an array over the sub-environments for each key, and a mask ``_key``."""
@@ -241,12 +249,12 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             columns.update(dict.fromkeys(names.masks, everywhere))
             return columns
 
-        infos = named(INFO, rows[:TERMS])
+        infos = named(INFO, rows[:TERMS_ROW])
         terms, channels = (
-            named(REWARDS, rows[TERMS:APPLIED]),
-            named(DISTURBANCE, rows[APPLIED:REWARD]),
+            named(REWARDS, rows[TERMS_ROW:APPLIED_ROW]),
+            named(DISTURBANCE, rows[APPLIED_ROW:REWARD_ROW]),
         )
-        infos |= named(OTHERS, (terms, channels, rows[LOST] != 0, rows[TOUCHED] != 0))
+        infos |= named(OTHERS, (terms, channels, rows[LOST_ROW] != 0, rows[TOUCHED_ROW] != 0))
         ended = ends != 0
         reasons = np.zeros(self.num_envs, REASONS.dtype)
         reasons[ended] = REASONS[ends[ended]]

@@ -1,8 +1,8 @@
 """How the laws and the step drivers are compiled, and where the result is kept.
 
 A *law* is a scalar function (floats and named tuples of floats in, the same out). It is inlined into
-whatever calls it, so that a law exists once and costs no call. A *driver* knows arrays; it is what
-Python calls, and it is cached on disk.
+whatever calls it, so that a law exists once and costs no call. A *driver* works on arrays. Python calls
+it, and it is cached on disk.
 
 Numba's own cache looks only at the file that holds a function, not at the files which that function
 imports from. Here the folder of the cache is named by a hash over every source that can hold a law,
@@ -80,8 +80,8 @@ def law(function: F) -> F:
     Division by zero gives infinity as in NumPy (no branch per division), and no fast-math: two
     drivers that inline the same law must agree to the last bit.
 
-    Laws and blocks do not count references to the arrays that they are handed: whoever calls holds
-    them, and a count is an atomic write that threads would wait for. So they make no arrays, only views.
+    Laws and blocks do not count references to their array arguments: the caller holds the arrays, and a
+    count is an atomic write that threads would wait for. So they make no arrays, only views.
     """
     compiled: F = numba.njit(error_model="numpy", forceinline=True, nogil=True, _nrt=False)(
         function
@@ -105,7 +105,7 @@ def view(function: F) -> F:
 
 
 def allocating(function: F) -> F:
-    """Compile a short function that makes an array and hands it to a block."""
+    """Compile a short function that makes an array and passes it to a block."""
     compiled: F = numba.njit(error_model="numpy", forceinline=True, nogil=True)(function)
     return compiled
 
@@ -123,7 +123,7 @@ def driver(function: F) -> F:
 
 @intrinsic
 def fetch_add(typing: Any, numbers: Any, amount: Any) -> Any:
-    """Add to an array's first whole number and return what it was, as one step for all threads."""
+    """Add to an array's first whole number and return its old value, atomically."""
 
     def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
         array = create_struct_proxy(signature.args[0])(context, builder, value=values[0])

@@ -1,4 +1,4 @@
-"""What an environment reports of a robot after a step beside its observation: ``info`` and ``state``."""
+"""Results of a step beside the observation: ``info``, ``state`` and the reasons of an episode's end."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 
 class Info(NamedTuple):
-    """What ``info`` tells of one robot after a step; see :data:`INFO_MEANINGS`."""
+    """The contents of ``info`` for one robot after a step; see :data:`INFO_MEANINGS`."""
 
     position_error_mm: float
     formation_error_mm: float
@@ -40,11 +40,11 @@ INFO_MEANINGS = {
     "leader and before one gap",
     "slip_mm_s": "largest slip speed of a drive wheel in the step",
     "torque_l_Nmm": "torque delivered to the left wheel, mean over the step",
-    "torque_r_Nmm": "the same, right",
+    "torque_r_Nmm": "torque delivered to the right wheel, mean over the step",
     "torque_rms_Nmm": "root mean square over the step and both wheels",
-    "energy_mJ": "work that the motors put in during the step; braking gives none back",
-    "slid_mm": "mean way that the drive wheels slipped in the step",
-    "saturation_fraction": "share of the substeps with a torque asked for at its limit",
+    "energy_mJ": "work of the motors during the step; braking returns none",
+    "slid_mm": "mean distance that the drive wheels slipped in the step",
+    "saturation_fraction": "share of the substeps with a commanded torque at its limit",
     "innovation_nis": "normalised innovation squared of the EKF, mean over the step",
     "x_mm": "true position of c",
     "y_mm": "true position of c",

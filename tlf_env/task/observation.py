@@ -1,4 +1,4 @@
-"""What a policy sees: the observations ``tracking`` and ``sensor``, entry by entry, and their scales."""
+"""The observations ``tracking`` and ``sensor``: their entries, units and scales."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ OBSERVATION_LIMIT = 10.0
 
 
 class Entry(NamedTuple):
-    """One entry of an observation: what it means, its unit, and the value that is scaled to 1."""
+    """One entry of an observation: its meaning, its unit, and the value that is scaled to 1."""
 
     meaning: str
     unit: str
@@ -69,8 +69,12 @@ TRACKING_ENTRIES = {
     "odometry_u_2": Entry("yaw rate by the wheels, mean over the last step", "rad/s", 2.0),
     "last_action_0": Entry("last action, first component", "1", 1.0),
     "last_action_1": Entry("last action, second component", "1", 1.0),
-    "command_u_1": Entry("speed last asked of the wheels; 0 with action `torque`", "mm/s", 1000.0),
-    "command_u_2": Entry("yaw rate last asked of the wheels; 0 with action `torque`", "rad/s", 8.0),
+    "command_u_1": Entry(
+        "last commanded speed of the wheels; 0 with action `torque`", "mm/s", 1000.0
+    ),
+    "command_u_2": Entry(
+        "last commanded yaw rate of the wheels; 0 with action `torque`", "rad/s", 8.0
+    ),
     "innovation_forward": Entry("EKF innovation forward, mean over the last step", "mm", 1.0),
     "innovation_right": Entry("EKF innovation to the right, mean over the last step", "mm", 1.0),
     "slip_1": Entry("estimate of the slip δ₁; 0 with the paper's EKF", "mm/s", 100.0),
@@ -80,16 +84,16 @@ TRACKING_ENTRIES = {
     "is_leader": Entry("1 for the leader (robot_0)", "1", 1.0),
     "is_last": Entry("1 for the last robot of the formation", "1", 1.0),
     "predecessor_forward": Entry(
-        "place of the predecessor as last heard, forward of the estimated pose; this and the five that "
-        "follow are 0 for the leader",
+        "position of the predecessor by its last message, forward of the estimated pose; this and the "
+        "five that follow are 0 for the leader",
         "mm",
         500.0,
     ),
-    "predecessor_right": Entry("its place, to the right of the estimated pose", "mm", 500.0),
+    "predecessor_right": Entry("its position, to the right of the estimated pose", "mm", 500.0),
     "predecessor_sin_turn": Entry("sine of its heading minus the estimated heading", "1", 1.0),
     "predecessor_cos_turn": Entry("cosine of its heading minus the estimated heading", "1", 1.0),
-    "predecessor_u_1": Entry("its speed as last heard", "mm/s", 500.0),
-    "predecessor_u_2": Entry("its yaw rate as last heard", "rad/s", 2.0),
+    "predecessor_u_1": Entry("its speed by the last message", "mm/s", 500.0),
+    "predecessor_u_2": Entry("its yaw rate by the last message", "rad/s", 2.0),
 }
 
 
@@ -105,8 +109,10 @@ class Preview(NamedTuple):
 
 
 PREVIEW_ENTRIES = {
-    "forward": Entry("place of the later reference, forward of the estimated pose", "mm", 500.0),
-    "right": Entry("place of the later reference, to the right of the estimated pose", "mm", 500.0),
+    "forward": Entry("position of the later reference, forward of the estimated pose", "mm", 500.0),
+    "right": Entry(
+        "position of the later reference, to the right of the estimated pose", "mm", 500.0
+    ),
     "sin_turn": Entry("sine of its heading minus the estimated heading", "1", 1.0),
     "cos_turn": Entry("cosine of its heading minus the estimated heading", "1", 1.0),
     "u_1": Entry("its speed u₁*", "mm/s", 500.0),
@@ -132,7 +138,7 @@ def scaled(value: float, scale: float) -> float:
 
 @law
 def preview_entries(later: Reference | Message, x: float, y: float, theta: float) -> Preview:
-    """A later reference, or another robot as heard, as seen from an estimated pose."""
+    """A later reference, or another robot by its message, relative to an estimated pose."""
     forward, right = body_errors(later.x - x, later.y - y, theta)
     turn = wrap(later.theta - theta)
     return Preview(forward, right, math.sin(turn), math.cos(turn), later.u_1, later.u_2)
@@ -170,12 +176,12 @@ SENSOR_TAIL_ENTRIES = {
     "start_sin": Entry("sine of the start heading", "1", 1.0),
     "start_cos": Entry("cosine of the start heading", "1", 1.0),
     "message_x": Entry(
-        "x from the own start's: the leader's reference now, or what the predecessor broadcast one "
+        "x relative to the own start: the leader's reference now, or the predecessor's broadcast of one "
         "gap ago (before that, its start pose at rest)",
         "mm",
         1000.0,
     ),
-    "message_y": Entry("y likewise", "mm", 1000.0),
+    "message_y": Entry("y of the same", "mm", 1000.0),
     "message_sin": Entry("sine of its heading", "1", 1.0),
     "message_cos": Entry("cosine of its heading", "1", 1.0),
     "message_u_1": Entry("its speed", "mm/s", 500.0),
