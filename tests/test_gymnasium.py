@@ -196,7 +196,7 @@ def test_an_unknown_learner_is_named(learner: Any) -> None:
 @pytest.mark.parametrize(
     ("others", "message"),
     [
-        ("referenz", "others 'referenz' is neither 'reference' nor 'module:factory' nor an object"),
+        ("referenz", "others 'referenz' must be 'reference', 'module:factory' or an object"),
         (3, r"others 3 has no predict\(\)"),
         (None, r"others None has no predict\(\)"),
         ("no_such_module:Policy", "cannot import 'no_such_module'"),
@@ -475,7 +475,7 @@ def test_reset_starts_the_trajectory_at_a_phase(phase_s: Any) -> None:
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        ({"pose": 1}, "reset option 'pose' is unknown; there are poses, phase_s"),
+        ({"pose": 1}, "reset option 'pose' is unknown; the options are poses, phase_s"),
         ({"phase_s": np.nan}, "phase_s must be a finite number of seconds, got nan"),
         ({"phase_s": -np.inf}, "phase_s must be a finite number of seconds, got -inf"),
         ({"phase_s": "1"}, "phase_s must be a finite number of seconds, got '1'"),

@@ -355,15 +355,18 @@ class TestWaypoints:
             ("0,0,0\n1,1,1\n", "header must be"),
             ("t_s,x_mm,y_mm\n", "must have 2 to 100000 waypoints, got 0"),
             ("t_s,x_mm,y_mm\n0,0,0\n", "must have 2 to 100000 waypoints, got 1"),
-            ("t_s,x_mm,y_mm\n0,0,0\n1,5\n", "line 3: needs 3 numbers, t_s,x_mm,y_mm, got 2"),
+            ("t_s,x_mm,y_mm\n0,0,0\n1,5\n", "line 3: must be 3 numbers, t_s,x_mm,y_mm, got 2"),
             ("t_s,x_mm,y_mm\n0,0,0\n\n1,a b,0\n", "line 4: x_mm must be a number within"),
             ("t_s,x_mm,y_mm\n0,0,0\n1,nan,0\n", "line 3: x_mm must be a number"),
             ("t_s,x_mm,y_mm\n0,0,0\n1,1,inf\n", "line 3: y_mm must be a number"),
             ("t_s,x_mm,y_mm\n0,0,0\n1,,1\n", "got ''"),
             ("t_s,x_mm,y_mm\n0,0,0\n0,5,0\n", "line 3: t_s 0 must be above 0"),
-            ("t_s,x_mm,y_mm\n2,0,0\n1.5,5,0\n", "line 3: t_s 1.5 must be above 2, the time before"),
-            ("t_s,x_mm,y_mm\n0,0,0\n1,800,900\n", "is 1204.16 mm/s; a robot can be asked for 1000"),
-            ("t_s,x_mm,y_mm\n0,7,7\n1,7,7\n", "all waypoints are at one place"),
+            (
+                "t_s,x_mm,y_mm\n2,0,0\n1.5,5,0\n",
+                "line 3: t_s 1.5 must be above 2, the previous time",
+            ),
+            ("t_s,x_mm,y_mm\n0,0,0\n1,800,900\n", "is 1204.16 mm/s; at most 1000 is allowed"),
+            ("t_s,x_mm,y_mm\n0,7,7\n1,7,7\n", "all waypoints are at the same position"),
         ],
     )
     def test_a_bad_file_is_told_in_one_line(self, tmp_path, text, said):
@@ -385,12 +388,12 @@ class TestWaypoints:
             ({}, "either points or file"),
             ({"points": [(0, 0, 0), (1, 1, 1)], "file": "a.csv"}, "either points or file"),
             ({"points": "0,0,0"}, "points must be a list"),
-            ({"points": [(0, 0, 0), 5]}, "points[1]: needs 3 numbers"),
+            ({"points": [(0, 0, 0), 5]}, "points[1]: must be 3 numbers"),
             ({"points": [(0, 0, 0), (1, None, 5)]}, "points[1]: x_mm must be a number"),
             ({"points": [(0, 0, 0), (1, True, 5)]}, "points[1]: x_mm must be a number"),
             ({"points": [(0, 0, 0), (1, 1e10, 5)]}, "within ±1e+09, got 10000000000.0"),
             ({"points": [(0, 0, 0), (0, 1, 5)]}, "points[1]: t_s 0 must be above 0"),
-            ({"file": 5}, "file must be a name, got 5"),
+            ({"file": 5}, "file must be a path, got 5"),
             ({"points": [(0, 0, 0), (1, 1, 1)], "speed": 3}, "unknown key"),
         ],
     )
@@ -466,7 +469,7 @@ class TestWarnings:
 
     def test_resting_at_the_end_is_no_stop(self):
         gentle = Waypoints(points=[(0, 0, 0), (10, 1000, 0), (20, 2000, 0), (21, 2000, 0)])
-        assert "stands still" not in said(gentle, 40.0)
+        assert "at rest" not in said(gentle, 40.0)
 
     def test_speed(self):
         text = said(Circle(radius_mm=9000, speed_mm_s=1100))
@@ -481,7 +484,7 @@ class TestWarnings:
         assert "acceleration 490 mm/s² (490 of it sideways) is above 432 mm/s²" in above_dynamic
         above_static = said(Circle(radius_mm=1000, speed_mm_s=800))
         assert "acceleration 640 mm/s²" in above_static
-        assert "above 573 mm/s², where the drive wheels break loose" in above_static
+        assert "above 573 mm/s², the static grip limit of the drive wheels" in above_static
 
     @pytest.mark.parametrize(("share", "warned"), [(0.95, False), (1.05, True)])
     def test_motors_on_a_straight(self, share, warned):

@@ -1,1 +1,1 @@
-"""The learning libraries' interfaces. No physics and no mathematics: only spaces, dictionaries and ends."""
+"""Interfaces of the learning libraries: spaces, dictionaries and ends of episodes, without physics."""

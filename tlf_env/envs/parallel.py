@@ -33,18 +33,18 @@ from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
 Agent = str
 Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
 START_POSE_LIMIT_MM = 1e9
-PETTINGZOO_TEST_OPTION = "options"  # what PettingZoo's own API test passes; means nothing
+PETTINGZOO_TEST_OPTION = "options"  # PettingZoo's API test passes this option; it is ignored
 
 
 MAKERS = ("tlf_env", "gymnasium", "pettingzoo")  # packages between a caller and the environment
 
 
 class ReferenceWarning(UserWarning):
-    """The reference asks something that the robots cannot do, or that an observation cannot tell."""
+    """The reference exceeds limits of the robots or of the observation."""
 
 
 def callers_level() -> int:
-    """``stacklevel`` for a warning from the calling function: the first frame of no maker."""
+    """``stacklevel`` of a warning by the calling function: the first frame outside :data:`MAKERS`."""
     level, frame = 1, sys._getframe(1)
     while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in MAKERS:
         level, frame = level + 1, frame.f_back
@@ -53,34 +53,35 @@ def callers_level() -> int:
 
 @documented
 class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
-    """Robots in a row follow each other one time gap apart; every robot is an agent.
+    """Robots in a line follow each other one time gap apart; every robot is an agent.
 
-    Agents ``robot_0`` (the leader, on the scenario's trajectory) to ``robot_{n-1}``; each follower's
-    reference comes from its predecessor's broadcast of one gap ago. All act at every control step.
-    Actions, observations, rewards and infos: the tables below, which are made from the code.
+    The agents are ``robot_0`` (the leader, on the scenario's trajectory) to ``robot_{n-1}``; each
+    follower's reference is computed from its predecessor's broadcast of one gap ago. All agents act at every
+    control step. The tables of actions, observations, rewards and infos below are made from the code.
 
-    Observations are made from what the robot knows on board, never from the truth; their size does
-    not depend on the number of robots. An episode ends for the whole formation at once: when a robot
-    is lost or touches another (as ``end_on`` says), or at the horizon. The robots concerned are
-    terminated, the others truncated.
+    Observations use data on board, not the true state (except with the estimator ``truth``); their size does
+    not depend on the number of robots. An episode ends for the whole formation at once: when a robot is lost
+    or touches another (if listed in ``end_on``), or at the horizon. The robots concerned are terminated, the
+    others truncated.
 
     Parameters
     ----------
     scenario
-        A preset's name, a YAML file, a mapping or a :class:`~tlf_env.task.scenario.Scenario`.
+        The name of a preset (a YAML file shipped in ``configs/``), a YAML file, a mapping or a
+        :class:`~tlf_env.task.scenario.Scenario`.
     render_mode
-        None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, drawn by every
-        :meth:`reset` and :meth:`step`, no faster than the robots move).
+        None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, updated by every
+        :meth:`reset` and :meth:`step`, at most in real time).
     adversary
-        Called with the environment before every step; returns ``{channel: value or one per robot}``
-        to set for that step, e.g. ``{"slip.delta_1_mm_s": 20.0}``.
+        Called with the environment before every step; returns ``{channel: value or one per robot}`` to
+        apply in that step, e.g. ``{"slip.delta_1_mm_s": 20.0}``.
     **overrides
         Fields of the scenario; ``disturbance_level`` too.
 
     Raises
     ------
     ValueError
-        for an unknown key or an impossible value, in one line.
+        in one line, for an unknown key or an invalid value.
     """
 
     def __init__(
@@ -134,12 +135,12 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
 
     @property
     def formation(self) -> Formation:
-        """The simulation behind the environment; its truth is not for policies."""
+        """The simulation behind the environment; policies must not use its true state."""
         return self._formation
 
     @property
     def space(self) -> pymunk.Space:
-        """The pymunk space, its bodies where the robots are now."""
+        """The pymunk space, with its bodies at the present poses of the robots."""
         return self._formation.space
 
     def observation_space(self, agent: Agent) -> gymnasium.spaces.Box:
@@ -158,16 +159,16 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         Parameters
         ----------
         seed
-            0 to 2⁶³ − 1. The same seed gives the same episode, bit for bit. Without one the next
-            episode of the last seed begins, or of a random one where there was none.
+            0 to 2⁶³ − 1. The same seed gives the same episode, bit for bit. None starts the next episode
+            of the last seed, or of a random seed if there was none.
         options
-            ``poses``: start poses of c, ``(robot, 3)`` in mm, mm, rad (at rest); ``phase_s``: the
-            leader's reference starts that much later on its trajectory.
+            ``poses``: start poses of c at rest, ``(robot, 3)`` in mm, mm, rad; ``phase_s``: the time on
+            its trajectory at which the leader's reference starts.
 
         Raises
         ------
         ValueError
-            for a seed out of its range, an unknown option or an impossible value of one.
+            for a seed out of its range, an unknown option or an invalid value.
         ImportError
             in mode ``human`` without pygame.
         """
@@ -205,8 +206,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         Raises
         ------
         ValueError
-            for a missing, unknown, wrongly shaped or non-finite action, naming the robot; the
-            episode stands as it was.
+            for a missing, unknown, wrongly shaped or non-finite action, naming the robot; the episode
+            is not changed.
         RuntimeError
             before the first :meth:`reset`.
         """
@@ -254,7 +255,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     def _complain(self, actions: dict[Agent, np.ndarray]) -> None:
         unknown = [agent for agent in actions if agent not in self.agents]
         missing = [agent for agent in self.agents if agent not in actions]
-        what = f"{unknown[0]!r} is no agent" if unknown else f"no action for {missing[0]}"
+        what = f"{unknown[0]!r} is not an agent" if unknown else f"no action for {missing[0]}"
         raise ValueError(f"{what}; the agents are {', '.join(self.agents)}")
 
     def _ends(self) -> tuple[dict[Agent, bool], dict[Agent, bool], dict[Agent, str]]:
@@ -295,13 +296,13 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return infos
 
     def state(self) -> np.ndarray:
-        """The truth for critics, float32: :class:`tlf_env.engine.layout.State` of every robot, scaled."""
+        """The true state for critics, float32: scaled :class:`tlf_env.task.info.State` of every robot."""
         return (self._formation.state() / STATE_SCALES).astype(np.float32).ravel()
 
     def render(self) -> np.ndarray | None:
         """A frame ``(height, width, 3)`` uint8 in mode ``rgb_array``; None in mode ``human``.
 
-        In mode ``human`` there is nothing left to do: :meth:`reset` and :meth:`step` have drawn.
+        In mode ``human`` it does nothing: :meth:`reset` and :meth:`step` have drawn the frame.
 
         Raises
         ------
@@ -309,7 +310,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             before the first :meth:`reset`, or if the environment was made without a render mode.
         """
         if self.render_mode is None or self._seed is None:
-            raise RuntimeError("render() needs a render_mode and a reset() before")
+            raise RuntimeError("render() needs a render_mode and a previous reset()")
         return None if self.render_mode == "human" else self._draw(self.render_mode)
 
     def _draw(self, mode: str) -> np.ndarray | None:
@@ -330,7 +331,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                         "scale": patch.scale,
                     }
                     for patch in map(PatchRow._make, patch_rows(self.scenario.disturbance).tolist())
-                    if patch.scale != 1  # else the floor there is as everywhere
+                    if patch.scale != 1  # otherwise the patch has no effect
                 ],
             )
         return self._renderer.draw(scene_of(self._formation))
@@ -339,7 +340,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return self._formation.leader_path()
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if any."""
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -349,7 +350,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
 
 
 def separate_parts(overrides: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Factory]]:
-    """Parts given as objects: the scenario gets their names, the formation the factories."""
+    """Split off parts that are given as objects: overrides with their names, and their factories by role."""
     parts = {
         role: overrides[role]
         for role in ("estimator", "wheel_loop", "observer")
@@ -359,16 +360,16 @@ def separate_parts(overrides: dict[str, Any]) -> tuple[dict[str, Any], dict[str,
 
 
 def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | None, float]:
-    """The start poses, if given, and the phase (s) of ``reset``'s options.
+    """The start poses, if any, and the phase (s) in the options of ``reset``.
 
     Raises
     ------
     ValueError
-        for an unknown option or an impossible value.
+        for an unknown option or an invalid value.
     """
     unknown = sorted(set(options) - {"poses", "phase_s", PETTINGZOO_TEST_OPTION})
     if unknown:
-        raise ValueError(f"reset option {unknown[0]!r} is unknown; there are poses, phase_s")
+        raise ValueError(f"reset option {unknown[0]!r} is unknown; the options are poses, phase_s")
     phase_s = options.get("phase_s", 0.0)
     if (
         isinstance(phase_s, bool)
@@ -383,8 +384,8 @@ def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | No
     try:
         poses = np.asarray(options["poses"], dtype=np.float64)
     except (TypeError, ValueError) as error:
-        told = " ".join(f"{error}, got {options['poses']!r}".split())
-        raise ValueError(f"reset option poses must be numbers: {told}") from error
+        why = " ".join(f"{error}, got {options['poses']!r}".split())
+        raise ValueError(f"reset option poses must be numbers: {why}") from error
     if poses.shape != (robots, 3) or not (np.abs(poses) <= START_POSE_LIMIT_MM).all():
         raise ValueError(
             f"reset option poses must be {robots} finite rows (x mm, y mm, θ rad) "
@@ -411,5 +412,5 @@ def aec_env(
     render_mode: str | None = None,
     **overrides: Any,
 ) -> Any:
-    """Make the turn-based form of the environment, by PettingZoo's own conversion."""
+    """Make the turn-based (AEC) environment by PettingZoo's conversion."""
     return parallel_to_aec(parallel_env(scenario, render_mode=render_mode, **overrides))

@@ -1,4 +1,4 @@
-"""The Gymnasium environment: one robot learns, the others are driven."""
+"""The Gymnasium environment: one robot is the learner, a policy drives the others."""
 
 from __future__ import annotations
 
@@ -21,34 +21,34 @@ BY_REFERENCE = "reference"
 
 @documented
 class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """One learner in a formation whose other robots are driven by a policy.
+    """One learner in a formation; a policy drives the other robots.
 
     Actions, observations, rewards and infos are those of the learner in
-    :class:`tlf_env.envs.parallel.FormationParallelEnv`: the tables below. The episode is terminated
-    if the learner is lost or touches another robot, and truncated at the horizon or if another robot
-    ends it.
+    :class:`tlf_env.envs.parallel.FormationParallelEnv`, see the tables below. The episode is terminated if
+    the learner is lost or touches another robot, and truncated at the horizon or if another robot ends it.
 
     Parameters
     ----------
     scenario
-        A preset's name, a YAML file, a mapping or a :class:`~tlf_env.task.scenario.Scenario`.
+        The name of a preset (a YAML file shipped in ``configs/``), a YAML file, a mapping or a
+        :class:`~tlf_env.task.scenario.Scenario`.
     learner
-        The agent that acts, ``"robot_0"`` to ``"robot_{n-1}"``; ``robot_1`` if None, in a formation
-        of one robot ``robot_0``.
+        The agent that acts, ``"robot_0"`` to ``"robot_{n-1}"``. None: ``robot_1``, or ``robot_0`` in a
+        formation of one robot.
     others
-        Who drives the rest: ``"reference"`` (the tracking law with the gains of ``residual_base``),
-        an object with SB3's ``predict`` that takes ``tracking`` observations and gives ``twist``
-        actions, or ``"module:factory"`` that makes one.
+        The policy of the other robots: ``"reference"`` (the tracking law with the gains of
+        ``residual_base``), an object with SB3's ``predict`` from ``tracking`` observations to ``twist``
+        actions, or ``"module:factory"`` of such an object.
     render_mode
-        None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, drawn by every
-        :meth:`reset` and :meth:`step`, no faster than the robots move).
+        None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, updated by every
+        :meth:`reset` and :meth:`step`, at most in real time).
     **overrides
         Fields of the scenario; ``disturbance_level`` too.
 
     Raises
     ------
     ValueError
-        for an unknown learner, key or value, in one line.
+        in one line, for an unknown learner, key or value.
     """
 
     metadata: dict[str, Any] = {"render_modes": list(RENDER_MODES), "render_fps": 50}
@@ -91,7 +91,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if isinstance(others, str):
             if ":" not in others:
                 raise ValueError(
-                    f"others {others!r} is neither {BY_REFERENCE!r} nor 'module:factory' nor an object"
+                    f"others {others!r} must be {BY_REFERENCE!r}, 'module:factory' or an object"
                 )
             driver = make_part("others", others, load_part(others))
         if isinstance(driver, type) or not hasattr(driver, "predict"):
@@ -100,13 +100,13 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     @property
     def scenario(self) -> Scenario:
-        """All that an episode depends on but its seed."""
+        """Everything that an episode depends on, except the seed."""
         return self.formation_env.scenario
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[np.ndarray, dict[str, Any]]:
-        """Start an episode; as :meth:`FormationParallelEnv.reset`, for the learner."""
+        """Start an episode, as :meth:`FormationParallelEnv.reset`; results are those of the learner."""
         super().reset(seed=seed)
         observations, infos = self.formation_env.reset(seed=seed, options=options)
         self._driver_state = None
@@ -119,8 +119,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         Raises
         ------
         ValueError
-            for a wrongly shaped or non-finite action, also of ``others``; the episode stands as it
-            was.
+            for a wrongly shaped or non-finite action, also of ``others``; the episode is not changed.
         RuntimeError
             before the first reset, or after the end of the episode.
         """
@@ -133,7 +132,7 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def _drive(self) -> dict[str, np.ndarray]:
         if self._driver is None or not self._rest:
-            return dict(self._still)  # the drivers put the reference's action in their place
+            return dict(self._still)  # the engine replaces these actions by the reference's
         seen = self.formation_env.formation.arrays.observations[0, self._rest]
         answer = self._driver.predict(seen, self._driver_state, self._driver_start.copy(), True)
         actions, self._driver_state = predicted(answer, (len(seen), ACTION_SIZE), "others")
@@ -141,13 +140,13 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return dict(zip(self._still, actions, strict=True))
 
     def state(self) -> np.ndarray:
-        """The truth for critics; see :meth:`FormationParallelEnv.state`."""
+        """The true state for critics; see :meth:`FormationParallelEnv.state`."""
         return self.formation_env.state()
 
     def render(self) -> np.ndarray | None:
-        """A frame in mode ``rgb_array``; None in mode ``human``, where reset and step have drawn."""
+        """A frame in mode ``rgb_array``; None in mode ``human``, where reset and step draw."""
         return self.formation_env.render()
 
     def close(self) -> None:
-        """Close the window, if there is one."""
+        """Close the window, if any."""
         self.formation_env.close()

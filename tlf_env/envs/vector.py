@@ -1,4 +1,4 @@
-"""Gymnasium's vector environment on the batch plant: one learner in each of many formations."""
+"""Gymnasium's vector environment: many formations with one learner each, on the batch plant."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ REASONS = np.array(END_REASONS)
 
 
 class Names(NamedTuple):
-    """Keys of Gymnasium's infos, and of the masks that tell where each is."""
+    """Keys of Gymnasium's infos, and of the masks of their sub-environments."""
 
     keys: tuple[str, ...]
     masks: tuple[str, ...]
@@ -55,25 +55,26 @@ INFO, REWARDS, DISTURBANCE, OTHERS = (
 
 
 class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
-    """Many formations with one learner each; the reference drives the other robots.
+    """Many formations with one learner each; the reference controller drives the other robots.
 
-    Sub-environment k seeded s is :class:`~tlf_env.envs.single.FormationEnv` seeded s + k, bit for bit,
-    until two robots touch. Without ``render``: make one environment for pictures.
+    Sub-environment k with seed s equals :class:`~tlf_env.envs.single.FormationEnv` with seed s + k, bit
+    for bit, until two robots touch. It has no ``render``: make a single environment for pictures.
 
     Parameters
     ----------
     scenario
-        As :class:`~tlf_env.engine.batch.BatchPlant` takes it: one, or a sequence that the formations share.
+        One scenario, or a sequence that is distributed over the formations; as in
+        :class:`~tlf_env.engine.batch.BatchPlant`.
     num_envs
-        How many formations.
+        Number of formations.
     learner
         The agent that acts in each; as in :class:`~tlf_env.envs.single.FormationEnv`.
     others
-        ``"reference"`` alone: a policy in Python would be called once per robot.
+        Only ``"reference"``: a policy in Python would be called once per robot.
     threads
-        How many work on a step; None takes one for each core.
+        Number of threads for a step; None: one per core.
     mixture
-        Whether every episode draws its scenario, or with what shares.
+        True, or a share for each scenario: every episode draws its scenario.
     autoreset_mode
         ``NextStep`` (Gymnasium's default), ``SameStep`` or ``Disabled``.
     render_mode
@@ -84,7 +85,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     Raises
     ------
     ValueError
-        for an unknown learner, mode, key or value, in one line.
+        in one line, for an unknown learner, mode, key or value.
     """
 
     def __init__(
@@ -134,7 +135,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.observation_space = batch_space(self.single_observation_space, self.num_envs)
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._actions = np.zeros((self.num_envs, robots, ACTION_SIZE))
-        self._over = np.zeros(self.num_envs, dtype=np.bool_)  # ended, and not begun again
+        self._over = np.zeros(self.num_envs, dtype=np.bool_)  # ended and not restarted
 
     def reset(
         self,
@@ -144,24 +145,24 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode in all formations, or in those of ``options["reset_mask"]``.
 
-        ``seed`` gives sub-environment k ``seed`` + k, or ``seed[k]``; without one its next episode
-        begins. Other options are the single environment's and have to be given there.
+        The seed of sub-environment k is ``seed`` + k, or ``seed[k]``; None starts its next episode. Other
+        options are not supported here.
 
         Raises
         ------
         ValueError
-            for a seed out of its range, a mask of another shape, or an option that does not exist here.
+            for a seed out of its range, a mask of another shape, or another option.
         """
         options = dict(options or {})
         mask = options.pop(RESET_MASK, None)
         start_options(options, self.scenario.robot_count)
         if options:
             raise ValueError(
-                f"reset option {next(iter(options))!r} does not exist in a vector environment; there "
-                f"is {RESET_MASK}"
+                f"reset option {next(iter(options))!r} does not exist in a vector environment; the "
+                f"only option is {RESET_MASK}"
             )
         begun = self._begun(mask) if seed is None else np.zeros_like(self._over)
-        if begun.any():  # its next episode has begun already
+        if begun.any():  # their next episode has started already
             self.plant.restart(begun)
             mask = ~begun if mask is None else mask & ~begun
         self.plant.reset(seed, mask)
@@ -175,13 +176,13 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """Advance all formations by one control period; ``actions`` is ``(num_envs, 2)``.
 
-        A formation that ended is begun again as ``autoreset_mode`` says. With ``NextStep`` its next
-        action is ignored, and that step gives the first observation and a reward of 0.
+        A formation that has ended is restarted according to ``autoreset_mode``. With ``NextStep`` its next
+        action is ignored, and that step returns the first observation and a reward of 0.
 
         Raises
         ------
         ValueError
-            for actions of another shape or not finite, naming the sub-environment; nothing has changed.
+            for actions of another shape or not finite, naming the sub-environment; nothing is changed.
         RuntimeError
             before the first reset, or in mode ``Disabled`` if a formation ended and was not reset.
         """
@@ -196,14 +197,14 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             )
         if self._over.any() and self.autoreset_mode is AutoresetMode.DISABLED:
             raise RuntimeError(
-                f"sub-environment {np.flatnonzero(self._over)[0]} ended: reset() it before step()"
+                f"sub-environment {np.flatnonzero(self._over)[0]} has ended; reset it before step()"
             )
         self._actions[:, self._robot] = given
         begun = self._over
         seen = self.plant.excerpt(self._robot)
         self.plant.step(self._actions, seen)
         rewards = seen.numbers[REWARD_ROW, : self.num_envs]
-        if begun.any():  # they have been started, and stand at their start again
+        if begun.any():  # already started: put them back to their start
             self.plant.restart(begun)
             self.plant.write_excerpt(seen, begun)
             rewards[begun] = 0.0
@@ -218,20 +219,20 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return seen.observations, rewards, terminated, truncated, infos
 
     def _begun(self, mask: np.ndarray | None) -> np.ndarray:
-        """The formations of the mask that ended and have been started again for the next step."""
+        """The formations of the mask that have ended and are already restarted for the next step."""
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP:
             return np.zeros_like(self._over)
         return self._over if mask is None else self._over & mask
 
     def _begin_again(self, last: Excerpt, infos: dict[str, Any]) -> tuple[Excerpt, dict[str, Any]]:
-        """What there is to tell of the new episodes, with what the ended ones left."""
+        """Excerpt and infos of the new episodes, with the final ones of the ended episodes."""
         seen = Excerpt(last.robot, last.numbers.copy(), last.observations.copy())
         self.plant.write_excerpt(seen, self._over)
-        left = np.full(self.num_envs, None, dtype=object)
+        final = np.full(self.num_envs, None, dtype=object)
         for k in np.flatnonzero(self._over):
-            left[k] = last.observations[k]
+            final[k] = last.observations[k]
         fresh = self._infos(seen)
-        fresh |= {"final_obs": left, "_final_obs": self._over.copy()}
+        fresh |= {"final_obs": final, "_final_obs": self._over.copy()}
         fresh |= {"final_info": infos, "_final_info": self._over.copy()}
         self._over[:] = False
         return seen, fresh
@@ -240,7 +241,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return seen.numbers[END_ROW, : self.num_envs].astype(np.int8)
 
     def _infos(self, seen: Excerpt) -> dict[str, Any]:
-        """Gymnasium's form: an array over the sub-environments for each key, and a mask ``_key``."""
+        """Infos in Gymnasium's form: for each key an array over the sub-environments and a mask ``_key``."""
         rows, ends = seen.numbers[:, : self.num_envs], self._ends(seen)
         everywhere = np.ones(self.num_envs, dtype=np.bool_)
 
@@ -261,4 +262,4 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         return infos | {"end": reasons, "_end": ended}
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Nothing is open."""
+        """Do nothing: there is no window to close."""

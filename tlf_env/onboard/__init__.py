@@ -1,5 +1,5 @@
-"""What runs on each robot, from what the robot can know: encoders, fixes and messages.
+"""Software on board of each robot; its inputs are encoders, position fixes and messages.
 
-At the sensor rate encoders, position fix, EKF and wheel loop; at the control period radio, observer and
-tracking law. No true state and no reward.
+At the physics period: encoders, position fix, EKF and wheel loop. At the control period: radio, observer
+and tracking law. It has no access to the true state or the reward.
 """

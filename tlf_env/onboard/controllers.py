@@ -1,4 +1,4 @@
-"""Controllers from YAML: presets and files of gains and limits, with what they need on board."""
+"""Controllers from YAML: presets and files of gains and limits, with the estimator that they need."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from tlf_env.onboard.tracking import Controller
 
 
 class ControllerFile(Frozen):
-    """What a controller file holds: the law's numbers, and fields that it asks of the scenario."""
+    """Contents of a controller file: numbers of the law, and fields of the scenario that it requires."""
 
     controller: Controller  # or the name of a preset
-    estimator: EstimatorKind | None = None  # None leaves it to the controller
+    estimator: EstimatorKind | None = None  # None: not required
     ekf_slip: SlipEkfParameters | None = None
-    found: dict[str, Any] | None = None  # how the numbers were found; nothing reads it
+    found: dict[str, Any] | None = None  # how the numbers were found; not used by the code
 
     @field_validator("controller", mode="before")
     @classmethod
@@ -31,13 +31,13 @@ class ControllerFile(Frozen):
 
     @property
     def scenario_overrides(self) -> dict[str, Any]:
-        """What the file asks of the scenario: ``estimator``, ``ekf_slip``, or neither."""
-        asked: dict[str, Any] = {}
+        """Fields of the scenario that the file sets: ``estimator``, ``ekf_slip``, or none."""
+        overrides: dict[str, Any] = {}
         if self.estimator is not None:
-            asked["estimator"] = self.estimator
+            overrides["estimator"] = self.estimator
         if self.ekf_slip is not None:
-            asked["ekf_slip"] = self.ekf_slip.model_dump()
-        return asked
+            overrides["ekf_slip"] = self.ekf_slip.model_dump()
+        return overrides
 
 
 def controller_names() -> list[str]:
@@ -46,12 +46,12 @@ def controller_names() -> list[str]:
 
 
 def load_controller(source: str | Path) -> ControllerFile:
-    """A controller file, by the name of a preset or its path.
+    """A controller file, by the name of a preset (a YAML file shipped in ``configs/``) or its path.
 
     Raises
     ------
     ValueError
-        in one line, if there is no such preset or file, or a key or a value in it is not allowed.
+        in one line, if there is no such preset or file, or a key or value in it is not allowed.
     """
     if is_file_name(source):  # a file may change between two calls
         return _loaded(source)
@@ -71,5 +71,5 @@ def _loaded(source: str | Path) -> ControllerFile:
 
 
 def controller(source: str | Path) -> Controller:
-    """Gains and limits of a preset or a controller file; as :func:`load_controller`."""
+    """Gains and limits of a preset or a controller file; errors as in :func:`load_controller`."""
     return load_controller(source).controller

@@ -1,7 +1,7 @@
 """Extended Kalman filter of the pose, eqs (28)–(41), from encoder increments and position fixes.
 
-Eq. (28) writes θᵢ on its right-hand side; here it is the midpoint θᵢ₋₁ + u₂/2, with Jacobians to match.
-The filter assumes wheels that do not slip.
+In place of θᵢ on the right-hand side of eq. (28) the midpoint θᵢ₋₁ + u₂/2 is used, with the Jacobians
+that follow from it. The filter assumes wheels without slip.
 """
 
 from __future__ import annotations
@@ -14,7 +14,7 @@ from tlf_env.numerics.trig import sincos
 
 
 class EkfParameters(Frozen):
-    """Noise of eqs (36) and (37). The αs multiply increments per sample (mm and rad)."""
+    """Noise of eqs (36) and (37). The coefficients α multiply increments per sample (mm and rad)."""
 
     alpha_1: NonNegative = 2e-3  # mm per mm
     alpha_2: NonNegative = 1e-2  # mm per rad
@@ -64,7 +64,7 @@ write_estimate = writer(Estimate)
 
 
 def ekf_constants(parameters: EkfParameters) -> Ekf:
-    """The filter's numbers as the compiled law takes them."""
+    """Constants of the filter for the compiled laws."""
     return Ekf(
         alpha_1=parameters.alpha_1,
         alpha_2=parameters.alpha_2,
@@ -76,7 +76,7 @@ def ekf_constants(parameters: EkfParameters) -> Ekf:
 
 @law
 def predict(estimate: Estimate, ekf: Ekf, u_1: float, u_2: float) -> Estimate:
-    """Eqs (28), (36), (38): pose and covariance one sample on, for increments u₁ (mm), u₂ (rad)."""
+    """Eqs (28), (36), (38): pose and covariance after one sample with increments u₁ (mm), u₂ (rad)."""
     sin, cos = sincos(estimate.theta + 0.5 * u_2)
     sd_1 = ekf.alpha_1 * abs(u_1) + ekf.alpha_2 * abs(u_2)
     sd_2 = ekf.alpha_3 * abs(u_1) + ekf.alpha_4 * abs(u_2)

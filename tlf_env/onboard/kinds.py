@@ -1,4 +1,4 @@
-"""The built-in estimators: their names in scenarios and files, and their codes in the compiled laws."""
+"""The built-in estimators: names in scenarios and files, and codes in the compiled laws."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from typing import Literal, get_args
 EstimatorKind = Literal["ekf", "ekf-slip", "truth"]
 ESTIMATOR_KINDS: tuple[EstimatorKind, ...] = get_args(EstimatorKind)
 
-EKF, TRUTH, EXTERNAL, EKF_SLIP = range(4)  # EXTERNAL: a Python object
+EKF, TRUTH, EXTERNAL, EKF_SLIP = range(4)  # EXTERNAL: the user's Python object
 ESTIMATOR_CODES: dict[str, int] = {"ekf": EKF, "ekf-slip": EKF_SLIP, "truth": TRUTH}

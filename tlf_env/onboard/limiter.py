@@ -1,8 +1,8 @@
-"""Limits on the twist that a controller asks for, so that the tyres can give it.
+"""Limits on the twist that a controller commands, so that the tyres can transmit it.
 
-A lateral error of 100 mm asks the paper's law for 4 rad/s; the wheels skid, and a filter that assumes no
-slip loses the heading. The limits act on the twist that the body is expected to have, which is the
-wheels' twist plus the estimated slip δ₁, δ₂ of eq. (14). They are not the paper's.
+For a lateral error of 100 mm the paper's law commands 4 rad/s: the wheels skid, and the heading of a
+filter that assumes no slip becomes wrong. The limits act on the expected twist of the body, which is the
+wheels' twist plus the estimated slip δ₁, δ₂ of eq. (14). They are not part of the paper.
 """
 
 from __future__ import annotations
@@ -15,26 +15,26 @@ from tlf_env.numerics.compiled import law
 
 
 class TwistLimits(Frozen):
-    """None leaves a limit out; without any the law is the paper's."""
+    """None: no such limit. Without any limit the law is that of the paper."""
 
-    forward_error_mm: Positive | None = None  # e₁ enters as E·tanh(e₁/E)
-    lateral_error_mm: Positive | None = None  # e₂ likewise
-    braking_error_mm: Positive | None = None  # before that, e₁ beyond w becomes √(w(2e₁ − w))
+    forward_error_mm: Positive | None = None  # E: e₁ becomes E·tanh(e₁/E)
+    lateral_error_mm: Positive | None = None  # the same for e₂
+    braking_error_mm: Positive | None = None  # w: before that, e₁ beyond w becomes √(w(2e₁ − w))
     acceleration_mm_s2: Positive | None = None  # of u₁
     yaw_acceleration_rad_s2: Positive | None = None  # of u₂
     yaw_rate_rad_s: Positive | None = None  # of |u₂|
     lateral_acceleration_mm_s2: Positive | None = None  # of |u₁ u₂|
-    turning_acceleration_mm_s2: Positive | None = None  # of u₁ where |u₁ u₂| is at its limit
-    # Where the position error is well below the reach, u₁ changes at once within so much of the reference's
-    # speed.
+    turning_acceleration_mm_s2: Positive | None = None  # of u₁ when |u₁ u₂| is at its limit
+    # While the position error is well below free_reach_mm, changes of u₁ within free_speed_mm_s of the
+    # reference's speed are not limited.
     free_speed_mm_s: NonNegative = 0.0
     free_reach_mm: Positive = 30.0
     reverse_mm_s: NonNegative | None = None  # of u₁ backward
-    cancel_slip: bool = False  # take the estimated slip off the wheels' twist
+    cancel_slip: bool = False  # subtract the estimated slip from the wheels' twist
 
 
 class TwistLimitsRow(NamedTuple):
-    """The same as the compiled law takes them; infinity where there is none."""
+    """The limits for the compiled laws; infinity: no such limit."""
 
     forward_error: float
     lateral_error: float
@@ -43,15 +43,15 @@ class TwistLimitsRow(NamedTuple):
     step_2: float  # rad/s per control step
     yaw_rate: float  # rad/s
     lateral: float
-    turning_loss: float  # mm/s per control step, what step_1 loses where |u₁ u₂| is at its limit
+    turning_loss: float  # mm/s per control step, reduction of step_1 when |u₁ u₂| is at its limit
     free: float  # mm/s
     free_reach: float  # mm
     reverse: float  # mm/s
-    slip: float  # 1 if the estimated slip counts, else 0
+    slip: float  # 1 if the estimated slip is subtracted, else 0
 
 
 def twist_limits_row(limits: TwistLimits, period_s: float) -> TwistLimitsRow:
-    """Limits for a control period, as the compiled law takes them."""
+    """The limits for a control period."""
     most, least = limits.acceleration_mm_s2, limits.turning_acceleration_mm_s2
     turning_loss = 0.0 if most is None or least is None else max(most - least, 0.0)
     return TwistLimitsRow(
@@ -72,7 +72,7 @@ def twist_limits_row(limits: TwistLimits, period_s: float) -> TwistLimitsRow:
 
 @law
 def saturated(error: float, most: float) -> float:
-    """A position error as the tracking law gets it, at most so large, mm."""
+    """A position error (mm) limited smoothly to ±``most``."""
     if most == math.inf:
         return error
     return most * math.tanh(error / most)
@@ -80,10 +80,10 @@ def saturated(error: float, most: float) -> float:
 
 @law
 def braked(error: float, linear: float) -> float:
-    """A forward error, mm, such that the speed k₁·error can be braked away on the way that is left.
+    """A forward error (mm) for which the speed k₁·error can be stopped within the remaining distance.
 
-    Beyond ``linear`` it grows as the root, with one slope where they meet: e₁ then falls under a constant
-    deceleration, k₁² times ``linear``.
+    Beyond ``linear`` it grows with the square root, with a continuous slope: e₁ then decreases with a
+    constant deceleration of k₁²·``linear``.
     """
     if abs(error) <= linear:
         return error
@@ -92,7 +92,7 @@ def braked(error: float, linear: float) -> float:
 
 @law
 def within(value: float, centre: float, reach: float) -> float:
-    """``value`` held within ``centre`` ± ``reach``."""
+    """``value`` clipped to ``centre`` ± ``reach``."""
     return min(max(value, centre - reach), centre + reach)
 
 
@@ -100,11 +100,11 @@ def within(value: float, centre: float, reach: float) -> float:
 def speed_range(
     b_1: float, b_2: float, cruise: float, error: float, limits: TwistLimitsRow
 ) -> tuple[float, float]:
-    """Speeds (mm/s) that the body may be asked for next, if ``b`` is what its last command comes to.
+    """Range of the next commanded speed of the body (mm/s), if ``b`` is the body's twist by the last command.
 
-    In a turn the motors have less left to accelerate with: the limit falls with the square of |b₁ b₂|. A
-    small correction of a small error, about the reference's speed ``cruise``, needs no limit; catching up
-    does, for it asks for all that the motors have.
+    In a turn less motor torque is left for acceleration: the limit decreases with the square of |b₁ b₂|.
+    Small corrections of a small error about the reference's speed ``cruise`` are not limited. A robot
+    that catches up is, since it would use the full torque.
     """
     used = min(abs(b_1 * b_2) / limits.lateral, 1.0)
     step = limits.step_1 - limits.turning_loss * used * used
@@ -128,11 +128,11 @@ def limited_twist(
     error: float,
     limits: TwistLimitsRow,
 ) -> tuple[float, float]:
-    """Twist for the wheels (mm/s, rad/s) if the body shall have ``u``.
+    """Twist for the wheels (mm/s, rad/s) for a wanted twist ``u`` of the body.
 
-    ``last`` is the wheels' twist of the step before, ``delta`` the estimated slip, ``cruise`` the
-    reference's speed (mm/s), ``error`` the estimated position error (mm). Where speed and yaw rate together
-    are too much, what is beyond the reference's speed gives way first, and then the yaw rate.
+    ``last`` is the wheels' twist of the previous step, ``delta`` the estimated slip, ``cruise`` the
+    reference's speed (mm/s), ``error`` the estimated position error (mm). If |u₁ u₂| exceeds its limit,
+    speed above the reference's speed is reduced first, then the yaw rate.
     """
     s_1, s_2 = limits.slip * delta_1, limits.slip * delta_2
     b_2 = within(within(u_2, 0.0, limits.yaw_rate), last_2 + s_2, limits.step_2)

@@ -18,7 +18,7 @@ class ObserverParameters(Frozen):
 
 
 class Message(NamedTuple):
-    """What a robot broadcasts: estimated pose of c (mm, rad) and twist (mm/s, rad/s)."""
+    """A robot's broadcast: estimated pose of c (mm, rad) and twist (mm/s, rad/s)."""
 
     x: float
     y: float
@@ -28,7 +28,7 @@ class Message(NamedTuple):
 
 
 class Reference(NamedTuple):
-    """What a robot follows, eq. (50): pose (mm, rad) and twist u₁*, u₂* (mm/s, rad/s)."""
+    """Reference of a robot, eq. (50): pose (mm, rad) and twist u₁*, u₂* (mm/s, rad/s)."""
 
     x: float
     y: float
@@ -59,9 +59,9 @@ def observer_rates(
 
 @law
 def dead_reckoned(message: Message, duration: float) -> Message:
-    """Where the sender is ``duration`` s after a message if it goes on with the twist it told.
+    """The sender's message ``duration`` s later, if it continues with the twist in this message.
 
-    It is on a circle, so that two steps of any length are one step of both.
+    The motion is a circular arc, so that two steps equal one step of their total duration.
     """
     turn = message.u_2 * duration
     half = 0.5 * turn
@@ -81,5 +81,5 @@ def dead_reckoned(message: Message, duration: float) -> Message:
 def observed_reference(
     x: float, y: float, theta: float, rate_x: float, rate_y: float, rate_theta: float
 ) -> Reference:
-    """Eq. (50): the observer's pose and the twist it moves with."""
+    """Eq. (50): the observer's pose and the twist of its motion."""
     return Reference(x, y, theta, math.sqrt(rate_x * rate_x + rate_y * rate_y), rate_theta)

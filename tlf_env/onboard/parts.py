@@ -1,8 +1,8 @@
-"""Parts of one's own on board: an estimator, a wheel loop or an observer as a Python object.
+"""User-defined parts on board: an estimator, a wheel loop or an observer as a Python object.
 
-A part is made by a *factory*, once per robot and once more at every reset: a class, a function, or
-the string ``"module:factory"``. It is called as ``factory(robot, period_s)`` with the robot's
-:class:`~tlf_env.physics.vehicle.RobotParameters` and the period (s) at which the part will run.
+A part is made by a *factory*, for each robot and again at every reset. A factory is a class, a function,
+or the string ``"module:factory"``. It is called as ``factory(robot, period_s)`` with the robot's
+:class:`~tlf_env.physics.vehicle.RobotParameters` and the period (s) at which the part runs.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from tlf_env.onboard.observer import Message, Reference
 PART_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_<][\w.<>]*$"  # <locals>, <lambda>: given as objects
 Factory = Callable[..., Any]
 
-# What each role calls, and with what.
+# Methods of each role, with their arguments.
 METHODS = {
     "estimator": {"reset": ("pose",), "update": ("steps_rad", "fix_mm")},
     "wheel_loop": {"reset": (), "torque": ("wanted_rad_s", "measured_rad_s")},
@@ -54,17 +54,17 @@ class WheelLoop(Protocol):
 
 
 class Observer(Protocol):
-    """Makes a follower's reference from what its predecessor broadcast one gap ago; control period."""
+    """Makes a follower's reference from its predecessor's broadcast of one gap ago; control period."""
 
     def reset(self, pose: np.ndarray) -> None:
         """Start at the follower's own pose ``(x mm, y mm, θ rad)``."""
 
     def update(self, message: Message, t_s: float) -> Reference:
-        """The reference for time ``t_s`` given the delayed message for that time."""
+        """The reference at time ``t_s`` from the delayed message for that time."""
 
 
 class Policy(Protocol):
-    """Whatever acts: the signature of SB3's ``predict``."""
+    """A policy, with the signature of SB3's ``predict``."""
 
     def predict(
         self,
@@ -77,13 +77,13 @@ class Policy(Protocol):
 
 
 def load_part(path: str) -> Factory:
-    """The object that ``"module:factory"`` names; modules beside the working directory are found too.
+    """The object that ``"module:factory"`` names; modules in the working directory are found too.
 
     Raises
     ------
     ValueError
-        in one line, if there is no such module or name, or the module cannot be imported, whatever
-        it raises.
+        in one line, if there is no such module or name, or the module raises any error when it is
+        imported.
     """
     module_name, _, name = path.partition(":")
     here = str(Path.cwd())
@@ -92,7 +92,7 @@ def load_part(path: str) -> Factory:
         sys.path.insert(0, here)
     try:
         target: Any = importlib.import_module(module_name)
-    except (Exception, SystemExit) as error:  # the module is the user's: it may raise anything
+    except (Exception, SystemExit) as error:  # a user's module can raise any error
         kind = "" if isinstance(error, ImportError) else f"{type(error).__name__}: "
         why = " ".join(f"{kind}{error}".split())
         raise ValueError(f"cannot import {module_name!r} of {path!r}: {why}") from error
@@ -115,17 +115,16 @@ def make_part(role: str, name: str, factory: Factory, *given: Any) -> Any:
     Parameters
     ----------
     role
-        ``estimator``, ``wheel_loop`` or ``observer``; anything else (``policy``, ``others``) has
+        ``estimator``, ``wheel_loop`` or ``observer``; any other role (``policy``, ``others``) needs
         SB3's ``predict``.
     name
-        The factory's, for errors.
+        Name of the factory, for errors.
 
     Raises
     ------
     ValueError
-        in one line that names role, factory and what is wanted, if the factory does not take what it
-        is called with (any TypeError of it counts), or what it makes lacks a method or has one that
-        cannot be called as it will be.
+        in one line with role, factory and the required methods, if the factory raises a TypeError, or
+        if its result lacks a method or has one that does not accept the arguments.
     """
     what = f"{role} {name!r}"
     call = "factory(robot, period_s)" if given else "factory()"
@@ -141,11 +140,11 @@ def make_part(role: str, name: str, factory: Factory, *given: Any) -> Any:
         if isinstance(part, type) or not callable(found):
             made = f"the class {part.__name__}" if isinstance(part, type) else type(part).__name__
             raise ValueError(
-                f"{what} has no {method}(): {call} made {made}, and what it makes needs {wanted}"
+                f"{what} has no {method}(): {call} made {made}; the result needs {wanted}"
             )
         try:
             signature = inspect.signature(found)
-        except (TypeError, ValueError):  # built-in: it does not tell
+        except (TypeError, ValueError):  # a built-in without a signature
             continue
         try:
             signature.bind(*names)
@@ -158,12 +157,12 @@ def make_part(role: str, name: str, factory: Factory, *given: Any) -> Any:
 
 
 def part_name(factory: Factory) -> str:
-    """``module:name`` of a factory, for the record."""
+    """``module:name`` of a factory, for the scenario."""
     return f"{factory.__module__}:{getattr(factory, '__qualname__', type(factory).__qualname__)}"
 
 
 def real_numbers(value: Any) -> np.ndarray | None:
-    """The value as float64, or None where it is not made of real numbers: text and complex are not."""
+    """The value as float64, or None if it contains anything but real numbers, as text or complex."""
     try:
         array = np.asarray(value)
         return array.astype(np.float64) if array.dtype.kind in "biuf" else None
@@ -171,32 +170,32 @@ def real_numbers(value: Any) -> np.ndarray | None:
         return None
 
 
-def predicted(answer: Any, shape: tuple[int, ...], who: str) -> tuple[np.ndarray, Any]:
-    """What a policy's ``predict`` returned: the actions, float64 in ``shape``, and its next state.
+def predicted(answer: Any, shape: tuple[int, ...], policy: str) -> tuple[np.ndarray, Any]:
+    """The result of a policy's ``predict``: actions, float64 in ``shape``, and the next state.
 
     Raises
     ------
     ValueError
-        naming the policy, if it is no pair, or the actions are no real numbers of that shape.
+        naming the policy, if it is not a pair, or the actions are not real numbers in that shape.
     """
     if not isinstance(answer, tuple) or len(answer) != 2:
         size = f" of {len(answer)}" if isinstance(answer, tuple) else ""
         raise ValueError(
-            f"{who}: predict() must return a pair, (actions, state), got {type(answer).__name__}{size}"
+            f"{policy}: predict() must return a pair, (actions, state), got {type(answer).__name__}{size}"
         )
     actions = real_numbers(answer[0])
     if actions is None:
         raise ValueError(
-            f"{who}: the actions must be real numbers in the shape {shape}, got "
+            f"{policy}: the actions must be real numbers in the shape {shape}, got "
             f"{' '.join(repr(answer[0]).split()):.60}"
         )
     if actions.shape != shape:
-        raise ValueError(f"{who}: the actions must have the shape {shape}, got {actions.shape}")
+        raise ValueError(f"{policy}: the actions must have the shape {shape}, got {actions.shape}")
     return actions, answer[1]
 
 
 def finite(value: Any, size: int, what: str) -> np.ndarray:
-    """What a part returned, as floats.
+    """The result of a part, as floats.
 
     Raises
     ------

@@ -1,13 +1,18 @@
-"""Extended Kalman filter of pose and slip: the paper's filter with two states more, δ₁ and δ₂ of eq. (14).
+"""Extended Kalman filter of pose and slip: the paper's filter with two more states, δ₁ and δ₂ of eq. (14).
 
-The wheels tell how far they rolled; the floor may move the robot on top of that, forward with δ₁ and
-in yaw with δ₂. Both are taken as random walks and are seen through the position fixes. The process
-noise is a variance per second, so that the filter is the same at every sampling rate.
+The encoders measure how far the wheels rolled; slip adds δ₁ forward and δ₂ in yaw. Both are modelled as
+random walks and estimated from the position fixes. The process noise is a variance per second, so that
+the filter is the same at every sampling rate.
 
-It learns three things while it runs. How noisy the fixes are: from the differences of successive
-innovations, which hardly see what else is wrong. Whether slip has just changed: then the innovations no
-longer average out, and the walks are widened until they do. And how, if it changed at once: a floor that
-begins to move takes the light wheels along and not the robot, and their speed jumps.
+The filter adapts in three ways:
+
+- The variance of the fixes is estimated from the differences of successive innovations, which depend
+  little on other errors.
+- Innovation test (``surprise``): after a change of slip the mean innovation is no longer zero. While it
+  exceeds what the noise of the fixes explains, process noise is added.
+- Sudden changes of slip: a floor that begins to move accelerates the light wheels and not the robot.
+  Wheel speeds that change faster than the motors allow are taken at once as slip, or as spin of a wheel
+  that has lost grip.
 """
 
 from __future__ import annotations
@@ -27,28 +32,30 @@ from tlf_env.onboard.estimator import (
     pose_gain,
 )
 
-ROUGHNESS_TIME_S = 0.5  # over which the encoders' roughness is learned
+ROUGHNESS_TIME_S = 0.5  # averaging time of the encoders' roughness (mean square of usual changes)
 POSE_AND_SLIP = ("p_x1", "p_y1", "p_t1", "p_x2", "p_y2", "p_t2")  # covariances of pose and slip
-JUMP_NOISE = 4.0  # standard deviations of encoder noise below which nothing is a jump
+JUMP_NOISE = 4.0  # smaller changes, in standard deviations of encoder noise, are no jumps
 
 
 class SlipEkfParameters(Frozen):
-    """Noise of the filter, and the bounds that its slip estimates are held within."""
+    """Noise of the filter, and bounds of its slip estimates."""
 
     forward_noise_mm2_s: NonNegative = 35.0  # of the position along the heading
     sideways_noise_mm2_s: NonNegative = 0.09
     heading_noise_rad2_s: NonNegative = 9.0e-6
     delta_1_walk_mm2_s3: NonNegative = 440.0
     delta_2_walk_rad2_s3: NonNegative = 0.0185
-    fix_variance_mm2: Positive = 0.2  # of each coordinate; where the filter begins
-    fix_variance_time_s: Positive | None = 0.5  # over which it is learned; None: it stays
+    fix_variance_mm2: Positive = 0.2  # of each coordinate, at the start
+    fix_variance_time_s: Positive | None = 0.5  # averaging time of its adaptation; None: constant
     least_fix_variance_mm2: Positive = 0.05
-    fix_variance_factor: Positive = 18.0  # of what was learned, for what this model leaves out
+    fix_variance_factor: Positive = 18.0  # on the adapted variance, for errors outside the model
     delta_1_bound_mm_s: NonNegative = 60.0
     delta_2_bound_rad_s: NonNegative = 0.415
-    # Surprise: innovations averaged over this time, squared, against what fixes alone explain. It sets in
-    # at the threshold and grows by 1 with every threshold more; None: never. At 1 this much process noise is
-    # added. It fades with the square of the speed below surprise_speed_mm_s: who stands cannot tell yaw.
+    # Surprise: how far the mean innovation exceeds what the fixes' noise explains (an innovation test). The
+    # innovations are averaged over surprise_time_s; the square of the mean is divided by the variance that
+    # the fixes alone explain. Surprise is 0 up to the threshold (None: always) and grows by 1 per further
+    # threshold, up to most_surprise. It multiplies the process noise below. Below surprise_speed_mm_s it
+    # decreases with the square of the speed: at rest the fixes contain no information on yaw.
     surprise_time_s: Positive = 0.05
     surprise_threshold: Positive | None = 6.2
     most_surprise: NonNegative = 5.0
@@ -56,19 +63,17 @@ class SlipEkfParameters(Frozen):
     heading_surprise_rad2_s: NonNegative = 3.4e-4
     delta_1_surprise_mm2_s3: NonNegative = 8000.0
     delta_2_surprise_rad2_s3: NonNegative = 0.18
-    # What the motors can do to a robot whose wheels roll. Wheels that change their speed faster were moved by
-    # the floor, which counts as slip, or have broken loose. None: nothing is read from them.
+    # Largest accelerations by the motors while the wheels roll. Wheels whose speed changes faster were moved
+    # by the floor (slip) or have lost grip (spin). None: the wheel speeds are not tested.
     most_acceleration_mm_s2: Positive | None = 650.0
     most_yaw_acceleration_rad_s2: Positive | None = 4.4
-    grip_mm_s2: NonNegative = 850.0  # with which a robot follows wheels that spin
+    grip_mm_s2: NonNegative = 850.0  # acceleration with which a robot follows spinning wheels
     yaw_grip_rad_s2: NonNegative = 5.0
-    jump_uncertainty: NonNegative = (
-        0.1  # standard deviation of such a jump of slip, as a share of it
-    )
+    jump_uncertainty: NonNegative = 0.1  # standard deviation of such a jump of slip, relative to it
 
 
 class SlipEkf(NamedTuple):
-    """Constants of the filter; variances of the process noise per sample."""
+    """Constants of the filter; process noise as variance per sample."""
 
     forward: float
     sideways: float
@@ -78,29 +83,26 @@ class SlipEkf(NamedTuple):
     variance: float
     bound_1: float
     bound_2: float
-    variance_weight: float  # share of a sample in the learned variance
+    variance_weight: float  # weight of a sample in the variance of the fixes
     least_variance: float
     variance_factor: float
-    mean_weight: float  # share of a sample in the mean innovation
-    threshold: float  # of the mean innovation's square, per variance of a fix
+    mean_weight: float  # weight of a sample in the mean innovation
+    threshold: float  # of the squared mean innovation, relative to the variance of a fix
     most_surprise: float
-    surprise_speed: float  # mm per sample from which on surprise counts whole
+    surprise_speed: float  # mm per sample; surprise is reduced below
     surprise_heading: float
     surprise_1: float
     surprise_2: float
-    change_1: float  # mm per sample and sample
-    change_2: float  # rad per sample and sample
-    grip_1: float  # likewise
-    grip_2: float
-    jump_variance: float  # variance of slip for the square of a jump of increments, 1/s²
-    roughness_weight: float  # share of a sample in the learned roughness
+    change_1: float  # mm per sample squared
+    change_2: float  # rad per sample squared
+    grip_1: float  # mm per sample squared
+    grip_2: float  # rad per sample squared
+    jump_variance: float  # variance of slip per square of a jump of increments, 1/s²
+    roughness_weight: float  # weight of a sample in the roughness
 
 
 class SlipEstimate(NamedTuple):
-    """Estimated δ₁ (mm/s), δ₂ (rad/s), what their rows add to the covariance's upper triangle.
-
-    And what was learned from the innovations.
-    """
+    """Estimated δ₁ (mm/s), δ₂ (rad/s), their part of the covariance's upper triangle, and adapted values."""
 
     delta_1: float
     delta_2: float
@@ -113,16 +115,16 @@ class SlipEstimate(NamedTuple):
     p_11: float
     p_12: float
     p_22: float
-    variance: float  # of a fix, beyond where the filter began, mm²
+    variance: float  # of a fix, minus its value at the start, mm²
     d_x: float  # last innovation, world axes, mm
     d_y: float
     mean_forward: float  # mean innovation, forward and right, mm
     mean_right: float
-    u_1: float  # the wheels' last increments, mm and rad
+    u_1: float  # last increments of the wheels, mm and rad
     u_2: float
-    spin_1: float  # what of them is spin, mm and rad
+    spin_1: float  # part of them that is spin, mm and rad
     spin_2: float
-    roughness_1: float  # mean square of their changes, by encoder noise mostly
+    roughness_1: float  # mean square of their usual changes, mostly encoder noise
     roughness_2: float
 
 
@@ -132,12 +134,12 @@ write_slip_estimate = writer(SlipEstimate)
 
 
 def sample_weight(dt_s: float, time_s: float) -> float:
-    """Weight of one sample in a mean over ``time_s``."""
+    """Weight of one sample in an exponential mean over ``time_s``."""
     return -math.expm1(-dt_s / time_s)
 
 
 def slip_ekf_constants(parameters: SlipEkfParameters, dt_s: float) -> SlipEkf:
-    """The filter's numbers for a sampling period of ``dt_s`` s, as the compiled law takes them."""
+    """Constants of the filter for a sampling period of ``dt_s`` s."""
     mean_weight = sample_weight(dt_s, parameters.surprise_time_s)
     return SlipEkf(
         forward=parameters.forward_noise_mm2_s * dt_s,
@@ -173,16 +175,16 @@ def slip_ekf_constants(parameters: SlipEkfParameters, dt_s: float) -> SlipEkf:
 
 @law
 def surprise(mean: float, variance: float, ekf: SlipEkf) -> float:
-    """How much more a mean innovation (mm) is than what fixes of this variance (mm²) explain.
+    """How far a mean innovation (mm) exceeds what fixes of this variance (mm²) explain; 0 if not.
 
-    White innovations of variance V have a mean, with the share a of each sample, of variance V·a/(2 − a).
+    For white innovations of variance V the exponential mean with weight a has the variance V·a/(2 − a).
     """
     return min(max(mean * mean / (ekf.threshold * variance) - 1.0, 0.0), ekf.most_surprise)
 
 
 @law
 def clamped_from_zero(value: float, end: float) -> float:
-    """``value`` held between 0 and ``end``."""
+    """``value`` clipped to the range between 0 and ``end``, which may be negative."""
     return min(max(value, min(end, 0.0)), max(end, 0.0))
 
 
@@ -190,11 +192,12 @@ def clamped_from_zero(value: float, end: float) -> float:
 def split_change(
     change: float, beyond: float, spin: float, most: float, rough: float, grip: float
 ) -> tuple[float, float, float]:
-    """What of a change of the wheels' increment was usual, what the floor did, and their new spin.
+    """Split a change of the wheels' increment: usual part, part due to the floor, and new spin.
 
-    More than motors and encoder noise can do to a robot that rolls leads either away from what was asked of
-    the wheels, which now are so far ``beyond`` it: the floor moved, or a wheel that spun got hold again. Or
-    towards it: the wheels broke loose. They then spin so much faster than the robot moves, which follows.
+    The usual part is at most what motors (``most``) and encoder noise can cause in a rolling robot. The rest
+    has one of two causes. If it is directed away from the commanded increment, which the wheels now exceed
+    by ``beyond``, the floor moved, or a spinning wheel regained grip. If it is directed towards it, the
+    wheels lost grip: they spin, faster than the robot moves by the spin, and the robot follows with ``grip``.
     """
     most += JUMP_NOISE * math.sqrt(rough)
     usual = min(max(change, -most), most)
@@ -223,10 +226,10 @@ def predict_with_slip(
     asked_2: float,
     dt: float,
 ) -> tuple[Estimate, SlipEstimate]:
-    """Pose, slip and covariance one sample on.
+    """Pose, slip and covariance after one sample.
 
-    The wheels' increments are u₁ (mm) and u₂ (rad); ``asked`` is what was asked of them, or their last
-    increments where nothing was.
+    The wheels' increments are u₁ (mm) and u₂ (rad); ``asked`` the commanded increments, or the last ones
+    if there is no command.
     """
     change_1, change_2 = u_1 - slip.u_1, u_2 - slip.u_2
     usual_1, jump_1, spin_1 = split_change(
@@ -319,7 +322,7 @@ corrected_slip = replacing(
 def correct_with_slip(
     estimate: Estimate, slip: SlipEstimate, ekf: SlipEkf, x: float, y: float
 ) -> tuple[Estimate, SlipEstimate, float, float, float]:
-    """Update with a position fix (mm); the slip estimates are held within their bounds.
+    """Update with a position fix (mm); the slip estimates are clipped to their bounds.
 
     Returns the estimates, the innovation in world axes (mm), and its normalised square (NIS).
     """
@@ -328,7 +331,7 @@ def correct_with_slip(
         estimate, max(ekf.variance_factor * known, ekf.least_variance)
     )
     d_x, d_y = x - estimate.x, y - estimate.y
-    # Successive innovations differ by twice the variance of a fix; a slow error cancels.
+    # Differences of successive innovations have twice the variance of a fix; slow errors cancel.
     step_x, step_y = d_x - slip.d_x, d_y - slip.d_y
     sin, cos = sincos(estimate.theta)
     forward, right = cos * d_y - sin * d_x, cos * d_x + sin * d_y

@@ -1,8 +1,8 @@
-"""Distance that a robot keeps from its predecessor, by what it last heard of it.
+"""Distance that a robot keeps from its predecessor, from the last message of the predecessor.
 
-Robots are circles for this purpose, as their outlines are. Where a twist would bring the two centres
-together faster than their distance allows, the centre's velocity loses the excess. Farther away the
-twist is left as it is, bit for bit. It is not the paper's.
+Robots are treated as circles, as their outlines are. If a twist would let the two centres approach
+faster than their distance allows, the excess is removed from the centre's velocity. Otherwise the twist is
+not changed, bit for bit. This is not part of the paper.
 """
 
 from __future__ import annotations
@@ -15,10 +15,10 @@ from tlf_env.numerics.compiled import law
 
 
 class Spacing(Frozen):
-    """How a robot keeps its distance.
+    """Parameters of the distance keeping.
 
-    Near ``distance_mm`` between the centres, the speed at which they may approach is ``gain_per_s`` times
-    the distance beyond it (nearer, they have to part); farther away it is the speed that
+    Near ``distance_mm`` between the centres, their largest approach speed is ``gain_per_s`` times the
+    distance beyond it (negative when closer: they have to separate). Farther away it is the speed that
     ``braking_mm_s2`` can stop.
     """
 
@@ -29,7 +29,7 @@ class Spacing(Frozen):
 
 
 class SpacingRow(NamedTuple):
-    """The same numbers as the compiled law takes them; no distance is kept if it is 0."""
+    """The parameters for the compiled laws; distance 0 means no distance keeping."""
 
     distance: float
     gain: float
@@ -38,7 +38,7 @@ class SpacingRow(NamedTuple):
 
 
 class Predecessor(NamedTuple):
-    """A predecessor in the robot's estimated body frame: place (mm), turn, and twist (mm/s, rad/s)."""
+    """The predecessor in the robot's estimated body frame: position (mm), turn, twist (mm/s, rad/s)."""
 
     forward: float
     right: float
@@ -49,7 +49,7 @@ class Predecessor(NamedTuple):
 
 
 def spacing_row(spacing: Spacing | None) -> SpacingRow:
-    """The numbers as the compiled law takes them."""
+    """The parameters for the compiled laws."""
     if spacing is None:
         return SpacingRow(0.0, 1.0, 1.0, 1.0)
     return SpacingRow(
@@ -62,10 +62,11 @@ def spacing_row(spacing: Spacing | None) -> SpacingRow:
 
 @law
 def approach_speed(room: float, leaving: float, row: SpacingRow) -> float:
-    """Speed (mm/s) towards another centre that has ``room`` (mm) left and itself leaves at ``leaving``.
+    """Largest speed (mm/s) towards another centre, ``room`` (mm) before the distance to keep.
 
-    What leaves may stop, and needs its way for it; what comes closer is met that much slower. Linear
-    near 0 and the root of a constant deceleration beyond, with one slope where they meet.
+    The other centre moves away at ``leaving`` (mm/s). If it does, its own stopping distance is added to the
+    room; if it comes closer, its speed is subtracted. Linear in the room near 0, and beyond by the square
+    root for a constant deceleration, with a continuous slope.
     """
     if leaving > 0.0:
         room += 0.5 * leaving * leaving / row.braking
@@ -80,7 +81,7 @@ def approach_speed(room: float, leaving: float, row: SpacingRow) -> float:
 def spaced_twist(
     u_1: float, u_2: float, predecessor: Predecessor, row: SpacingRow
 ) -> tuple[float, float]:
-    """The twist (mm/s, rad/s) nearest to ``u`` that keeps the distance from a predecessor."""
+    """The twist (mm/s, rad/s) closest to ``u`` that keeps the distance to a predecessor."""
     behind = row.behind
     d_forward = predecessor.forward + behind - behind * predecessor.cos_turn
     d_right = predecessor.right + behind * predecessor.sin_turn

@@ -18,7 +18,7 @@ from tlf_env.onboard.spacing import Spacing, SpacingRow, spacing_row
 
 @functools.cache
 def _consistent() -> dict[str, float]:
-    """The gains of the preset ``consistent``; gains are written in controller files only."""
+    """The gains of the preset ``consistent``; default gains exist only in controller files."""
     gains: dict[str, float] = read_preset_or_file("controller", "consistent")["controller"]["gains"]
     return gains
 
@@ -28,10 +28,10 @@ def _gain(name: str) -> Any:
 
 
 class TrackingGains(Frozen):
-    """Gains of eqs (19) and (21). A gain left out is that of ``configs/controllers/consistent.yaml``.
+    """Gains of eqs (19) and (21); defaults from ``configs/controllers/consistent.yaml``.
 
     ``k_2_mm2_s`` / ``k_3_mm2`` is the damping of the heading, 1/s. η is the bound on slip that the
-    complementary law assumes, in mm/s and rad/s at once, as printed.
+    complementary law assumes, one number for mm/s and rad/s, as printed in the paper.
     """
 
     k_1_per_s: Positive = _gain("k_1_per_s")
@@ -42,7 +42,7 @@ class TrackingGains(Frozen):
 
 
 class Gains(NamedTuple):
-    """The same numbers as the compiled law takes them."""
+    """The gains for the compiled laws."""
 
     k_1: float
     k_2: float
@@ -52,36 +52,36 @@ class Gains(NamedTuple):
 
 
 class Controller(Frozen):
-    """The tracking law's gains and the limits on what it asks for.
+    """Gains of the tracking law, and limits of its command.
 
-    With ``lead_s`` the reference's twist enters as it will be so much later, by a straight line to the
-    first preview: what is asked for holds for a control period, and the wheel loop takes its time.
+    ``lead_s``: the law uses the reference's twist this much later, interpolated linearly to the first
+    preview, to compensate for the control period and the lag of the wheel loop.
     """
 
     gains: TrackingGains = TrackingGains()
     limits: TwistLimits = TwistLimits()
-    spacing: Spacing | None = None  # the distance kept from the predecessor, if any
+    spacing: Spacing | None = None  # distance keeping to the predecessor, if any
     lead_s: NonNegative = 0.0
 
 
 class ControllerRow(NamedTuple):
-    """The same numbers as the compiled law takes them."""
+    """The controller for the compiled laws."""
 
     gains: Gains
     limits: TwistLimitsRow
     spacing: SpacingRow
-    lead: float  # as a fraction of the time to the first preview
+    lead: float  # fraction of the time to the first preview
 
 
 def controller_row(
     controller: Controller, period_s: float, preview_s: tuple[float, ...] = ()
 ) -> ControllerRow:
-    """Gains and limits for a control period and preview times (s), as the compiled law takes them.
+    """Gains and limits for a control period and preview times (s).
 
     Raises
     ------
     ValueError
-        if there is a lead and no preview to make it from.
+        if there is a lead and no preview above 0.
     """
     if controller.lead_s and not (preview_s and preview_s[0] > 0):
         raise ValueError(
@@ -97,13 +97,13 @@ def controller_row(
 
 
 def gains_row(gains: TrackingGains) -> Gains:
-    """The gains as the compiled law takes them."""
+    """The gains for the compiled laws."""
     return Gains(gains.k_1_per_s, gains.k_2_mm2_s, gains.k_3_mm2, gains.eta, gains.epsilon)
 
 
 @law
 def body_errors(d_x: float, d_y: float, theta: float) -> tuple[float, float]:
-    """Eq. (16), position part: e₁ forward and e₂ to the right (mm), for reference − robot in world axes."""
+    """Eq. (16): position errors e₁ forward and e₂ to the right (mm), from reference − robot in world axes."""
     sin, cos = sincos(theta)
     return -sin * d_x + cos * d_y, cos * d_x + sin * d_y
 
@@ -135,7 +135,7 @@ def complementary_twist(e_1: float, sin_e3: float, gains: Gains) -> tuple[float,
 def tracking_twist(
     e_1: float, e_2: float, sin_e3: float, cos_e3: float, u_1: float, u_2: float, gains: Gains
 ) -> tuple[float, float]:
-    """The whole law, (19) + (21)."""
+    """The complete law, (19) + (21)."""
     n_1, n_2 = nominal_twist(e_1, e_2, sin_e3, cos_e3, u_1, u_2, gains)
     c_1, c_2 = complementary_twist(e_1, sin_e3, gains)
     return n_1 + c_1, n_2 + c_2

@@ -25,7 +25,7 @@ class WheelLoopParameters(Frozen):
 
 
 class WheelLoopRow(NamedTuple):
-    """Digital form of eq. (13), torques in mN·mm: gain, integral step, lag decay and lag step."""
+    """Digital form of eq. (13), torques in mN·mm."""
 
     gain: float
     integral_step: float
@@ -34,7 +34,7 @@ class WheelLoopRow(NamedTuple):
 
 
 class WheelLoopState(NamedTuple):
-    """Torques held by the integrator and the lag of each wheel, mN·mm."""
+    """Torques of the integrator and the lag of each wheel, mN·mm."""
 
     integral_l: float
     lag_l: float
@@ -48,7 +48,7 @@ write_loop_state = writer(WheelLoopState)
 
 
 def digital_wheel_loop(parameters: WheelLoopParameters, dt_s: float) -> WheelLoopRow:
-    """Eq. (13) at a period of ``dt_s`` s: exact decay of the lag, and the current error already in."""
+    """Eq. (13) at a period of ``dt_s`` s, with exact decay of the lag and without delay of the error."""
     k, p = parameters.gain_Nmm_s, parameters.pole_rad_s
     a_1, a_0 = parameters.zeros_1, parameters.zeros_0
     integral = k * a_0 / p
@@ -68,7 +68,8 @@ def wheel_torque(
 ) -> tuple[float, float, float]:
     """Torque for a speed error in rad/s; returns ``(torque, integral, lag)``, torque within ±``limit``.
 
-    Anti-windup: while the torque is at its limit and the error asks for more, integrator and lag hold.
+    Anti-windup: while the torque is at its limit and the error would increase it, integrator and lag keep
+    their values.
     """
     next_integral = integral + loop.integral_step * error
     next_lag = loop.lag_decay * lag + loop.lag_step * error

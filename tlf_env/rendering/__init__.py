@@ -1,1 +1,1 @@
-"""Pictures of a formation seen from above. Reads the simulation, never changes it."""
+"""Pictures of a formation from above; the simulation is only read."""

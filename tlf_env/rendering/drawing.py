@@ -1,4 +1,4 @@
-"""Geometry of a picture, and soft shapes, lines and text on a pygame surface. Lengths are in canvas px."""
+"""Geometry of a picture, and antialiased shapes, lines and text on a pygame surface. Lengths in canvas px."""
 
 from __future__ import annotations
 
@@ -12,13 +12,13 @@ from tlf_env.rendering.looks import Colour
 
 FLOOR: Colour = (252, 252, 250)
 INK: Colour = (60, 62, 66)
-SOFT_PX = 0.7  # how far a soft edge reaches
-BLOCK = 6  # pieces of one colour in a line
+SOFT_PX = 0.7  # width of an antialiased edge
+BLOCK = 6  # segments of a line with the same colour
 CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 37)) for f in (np.cos, np.sin)], axis=-1)
 
 
 class View(NamedTuple):
-    """A window of the canvas and the floor in it; lengths in canvas px unless said."""
+    """A window of the canvas and the floor in it; lengths in canvas px unless noted."""
 
     left: int
     top: int
@@ -26,10 +26,10 @@ class View(NamedTuple):
     height: int
     corner_mm: tuple[float, float]  # x of the left edge, y of the top edge
     scale: float  # px per mm
-    pen: float  # px per px of the design
+    pen: float  # canvas px per px at the design size
 
     def px(self, points_mm: np.ndarray) -> np.ndarray:
-        """Canvas coordinates of points ``(..., 2)``; half a px on, since pygame cuts fractions off."""
+        """Canvas coordinates of points ``(..., 2)``, plus half a px since pygame truncates."""
         offset = (self.left + 0.5, self.top + 0.5)
         return (points_mm - self.corner_mm) * (self.scale, -self.scale) + offset
 
@@ -40,18 +40,18 @@ class View(NamedTuple):
         return Place(x, y, theta_rad, self.scale)
 
     def shows(self, px: np.ndarray, room: float = 0.0) -> np.ndarray:
-        """Which canvas points lie in the window or less than ``room`` beside it; NaN never does."""
+        """Which canvas points are in the window or less than ``room`` outside; NaN never is."""
         x, y = px[..., 0] - self.left, px[..., 1] - self.top
         return (x > -room) & (x < self.width + room) & (y > -room) & (y < self.height + room)
 
     @property
     def rect(self) -> tuple[int, int, int, int]:
-        """The window, as pygame takes rectangles."""
+        """The window as a pygame rectangle."""
         return self.left, self.top, self.width, self.height
 
 
 class Place(NamedTuple):
-    """A pose on the canvas and the scale there; its own axes are e (right) and f (forward), in mm."""
+    """A pose on the canvas and its scale; its axes are e (right) and f (forward), in mm."""
 
     x: float  # canvas px, to the right
     y: float  # canvas px, down
@@ -71,7 +71,7 @@ class Place(NamedTuple):
 
 
 class Shapes:
-    """Draws on a canvas, whose pixels are those of :class:`View` and :class:`Place`.
+    """Draws on a canvas in the px of :class:`View` and :class:`Place`.
 
     Parameters
     ----------
@@ -80,44 +80,44 @@ class Shapes:
     canvas
         The surface to draw on.
     font
-        That of the labels.
+        Font of the labels.
     """
 
     def __init__(self, pg: Any, canvas: Any, font: Any) -> None:
         self._pg, self._canvas, self._font = pg, canvas, font
 
     def label(self, text: str, ground: Colour = FLOOR, **anchor: Any) -> None:
-        """Text on the canvas; ``anchor`` as pygame names a rectangle's points."""
+        """Text on the canvas; ``anchor`` is a point of the text's rectangle, named as in pygame."""
         image = self._font.render(text, True, INK, ground)
         self._canvas.blit(image, image.get_rect(**anchor))
 
     def fill(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
-        """A polygon; pygame cuts fractions off."""
+        """A polygon, plus half a px since pygame truncates."""
         polygon = [(x + 0.5, y + 0.5) for x, y in points]
         self._pg.draw.polygon(self._canvas, colour, polygon)
 
     def _smooth(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
-        """A polygon with a soft edge around it, about 0.7 px wide."""
+        """A polygon with an antialiased edge, about 0.7 px wide."""
         self.fill(points, colour)
         self._pg.draw.aalines(self._canvas, colour, True, points)
 
     def bar(self, place: Place, size: tuple[float, float], colour: Colour) -> None:
-        """A rectangle around a place: its sides along e and f."""
+        """A rectangle around a place with sides along e and f."""
         e, f = (max(side / 2 - SOFT_PX, 0.3) / place.scale for side in size)
         self._smooth(place.px([(-e, -f), (e, -f), (e, f), (-e, f)]), colour)
 
     def cross(self, place: Place, arm: float, width: float, colour: Colour) -> None:
-        """Two bars, along e and along f, that reach ``arm`` from the place."""
+        """Two bars through the place, along e and f, ``arm`` to each side."""
         self.bar(place, (2 * arm, width), colour)
         self.bar(place, (width, 2 * arm), colour)
 
     def disc(self, place: Place, radius: float, colour: Colour) -> None:
-        """A full circle."""
+        """A filled circle."""
         points = (radius - SOFT_PX) * CIRCLE + (place.x, place.y)
         self._smooth(points.tolist(), colour)
 
     def ring(self, place: Place, radius: float, width: float, colour: Colour) -> None:
-        """A circle's line as one polygon: round outside, and back inside."""
+        """The line of a circle as one polygon: along the outside, and back along the inside."""
         half, middle = max(width / 2 - SOFT_PX, 0.3), (place.x, place.y)
         outside = ((radius + half) * CIRCLE + middle).tolist()
         inside = ((radius - half) * CIRCLE[::-1] + middle).tolist()
@@ -130,9 +130,9 @@ class Shapes:
         width: np.ndarray,
         colours: Sequence[Sequence[Colour]],
     ) -> None:
-        """Lines through ``(point, line, 2)``, ``width`` wide at each point, first blocks first.
+        """Lines through ``(point, line, 2)`` with the ``width`` at each point, drawn from the first block on.
 
-        A block is ``BLOCK`` pieces long; ``colours`` holds one for each block and line.
+        A block has ``BLOCK`` segments; ``colours`` contains one colour per block and line.
         """
         points = view.px(points_mm)
         along = np.gradient(points, axis=0)

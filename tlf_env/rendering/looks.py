@@ -1,4 +1,4 @@
-"""How robots look in every picture, frames and figures alike: colours and shapes. Needs no extra."""
+"""Colours and shapes of robots in frames and figures. Needs no optional extra."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ Colour = tuple[int, int, int]
 
 RENDER_MODES = ("human", "rgb_array")
 
-# Okabe and Ito's colours but yellow, which is lost on white; neighbours differ in luminance too.
+# Okabe and Ito's colours without yellow, which is hard to see on white; neighbours also differ in luminance.
 FEW_COLOURS: tuple[Colour, ...] = (
     (0, 0, 0),
     (230, 159, 0),
@@ -31,18 +31,18 @@ VIRIDIS = np.array(
         (253, 231, 37),
     ]
 )
-LIGHTEST = 0.92  # of the map; its end is lost on white
+LIGHTEST = 0.92  # of the map; its end is hard to see on white
 
-DRIVE_WHEEL_WIDTH_MM, CASTOR_WIDTH_MM = 22.0, 14.0  # of the picture; the model's are lines
-# A triangle ahead of the axle, of what the outline is ahead of c. Twice as long as it is wide, so
-# that its tip cannot be taken for a corner of its base.
+DRIVE_WHEEL_WIDTH_MM, CASTOR_WIDTH_MM = 22.0, 14.0  # in pictures; wheels have no width in the model
+# A triangle ahead of the axle, in units of the outline's extent ahead of c. Twice as long as wide, so that
+# its tip differs clearly from the corners of its base.
 NOSE = ((-0.2, 0.15), (0.2, 0.15), (0.0, 0.95))
 
 
 def robot_colours(robots: int) -> list[Colour]:
-    """Colours of robots 0 to ``robots`` − 1 that colour-blind eyes can tell apart, 0 to 255.
+    """Colours (0 to 255) of robots 0 to ``robots`` − 1, distinguishable for colour-blind readers.
 
-    Up to seven keep theirs whatever their number; more go along viridis, from dark to light.
+    For up to seven robots each number has a fixed colour; more are spread over viridis, from dark to light.
     """
     if robots <= len(FEW_COLOURS):
         return list(FEW_COLOURS[:robots])

@@ -1,6 +1,6 @@
-"""The formation from above, to scale, drawn with pygame-ce (the extra ``view``) onto plain surfaces.
+"""The formation from above, to scale, drawn with pygame-ce (the extra ``view``) on surfaces.
 
-Everything is drawn twice as large as it is shown and scaled down: that smooths every edge.
+Everything is drawn at twice the size and scaled down, which smooths all edges.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from tlf_env.rendering.looks import (
 from tlf_env.rendering.scene import Scene
 
 OVERSAMPLING = 2
-DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and grow with it
+DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and scale with it
 SMALLEST_PX = 64
 
 GRID: Colour = (222, 224, 226)
@@ -33,59 +33,59 @@ HALF_GRID: Colour = (239, 240, 241)
 PATH: Colour = (188, 190, 193)
 TYRE: Colour = (48, 50, 54)
 TREAD: Colour = (205, 208, 212)
-ALARM: Colour = (236, 0, 84)  # slip, lost, touched: no robot has it
+ALARM: Colour = (236, 0, 84)  # slip, lost, touched; no robot has this colour
 SLIPPERY: Colour = (214, 233, 246)
 GRIPPY: Colour = (247, 232, 210)
 
-AXLE_MM = 8.0  # for the picture only
-TREADS, TREAD_RADII = 4, 0.2  # few: more would seem to turn backwards at top speed and 20 frames/s
-# Where a slipping wheel's mark begins, and where it is strongest.
+AXLE_MM = 8.0  # in pictures only
+TREADS, TREAD_RADII = 4, 0.2  # more would seem to turn backwards at top speed and 20 frames/s
+# Slip speeds at which the mark of a slipping wheel begins and is strongest.
 SLIP_SHOWN_MM_S, SLIP_FULL_MM_S = 2.0, 60.0
 
 ARM_RADII = 0.25  # arms of the reference's cross
 MARGIN_RADII = 3.0  # room around the path, in outline radii
-MOST_START_MM = 1500.0  # how far the view grows towards robots that start off the path
+MOST_START_MM = 1500.0  # largest extension of the view towards robots that start off the path
 TRAIL_POINTS = 96  # of one trail
 PATH_POINTS = 1000
 TRAIL_PX, PATH_PX = 5.0, 2.0
-CLOSE_UP_PX, CLOSE_UP_RADII = 184, 3.2  # side of the close-up; how much floor, in outline radii
-CLOSE_UP_PEN = 1.3  # its lines against the others
+CLOSE_UP_PX, CLOSE_UP_RADII = 184, 3.2  # side of the close-up, in px and in outline radii of floor
+CLOSE_UP_PEN = 1.3  # width of its lines relative to the others
 EDGE_PX, LINE_PX, TABLE_PX = 14, 18, 230
-PLATE_ALPHA = 190  # of the ground under the table
-SMALLEST_TEXT, SMALLEST_CLOSE_UP = 0.6, 0.6  # of their size in the design
-TEXT_PX, TIME_PX = 19, 27  # of pygame's own font, whose letters are two thirds of that
-GRID_PX = 90  # least side of a grid square
+PLATE_ALPHA = 190  # of the background of the table
+SMALLEST_TEXT, SMALLEST_CLOSE_UP = 0.6, 0.6  # relative to their size in the design
+TEXT_PX, TIME_PX = 19, 27  # of pygame's font, whose letters are two thirds as high
+GRID_PX = 90  # smallest side of a grid square
 COLUMNS_PX = (18, 140, 208, 218)  # name, error, time gap, flags
 
 
 class Renderer:
-    """Draws scenes of one formation, and remembers where the robots were.
+    """Draws scenes of one formation, with trails of the robots' past positions.
 
     Parameters
     ----------
     robots
-        Each robot's measures.
+        Parameters of each robot.
     path_mm
-        The leader's whole reference, ``(k, 2)``. The view holds it and the robots' start, and stays;
-        a robot that leaves it shows as an arrow at the edge.
+        The leader's whole reference, ``(k, 2)``. The view contains it and the robots' start, and does not
+        move; a robot outside is shown as an arrow at the edge.
     mode
-        ``"rgb_array"``: frames as arrays, without any display. ``"human"``: a window, which waits so
-        that there are at most ``fps`` frames a second.
+        ``"rgb_array"``: frames as arrays, without a display. ``"human"``: a window with at most ``fps``
+        frames per second.
     fps
         Frames per second.
     size_px
         Width and height of the picture.
     trail_s
-        How far back the robots' trails go.
+        Duration of the robots' trails.
     patches
-        Round patches of other friction: mappings of ``x_mm``, ``y_mm``, ``radius_mm`` and ``scale``.
+        Round patches of different friction: mappings of ``x_mm``, ``y_mm``, ``radius_mm`` and ``scale``.
     close_up
-        The robot to draw large in a corner, or None. The last, if there are not so many.
+        Number of the robot in the close-up in a corner, at most that of the last robot; None: no close-up.
 
     Raises
     ------
     ImportError
-        without pygame, saying how to install it.
+        without pygame, with the command that installs it.
     ValueError
         for an unknown mode or a picture too small to draw on.
     """
@@ -123,12 +123,12 @@ class Renderer:
         self._resize(size_px)
 
     def begin(self, path_mm: np.ndarray) -> None:
-        """Forget the last episode: trails and view are made anew from the next scene on.
+        """Start an episode: trails and view are reset with the next scene.
 
         Parameters
         ----------
         path_mm
-            The leader's whole reference in the episode that begins, ``(k, 2)``.
+            The leader's whole reference in this episode, ``(k, 2)``.
         """
         stride = max(1, len(path_mm) // PATH_POINTS)
         self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
@@ -136,10 +136,10 @@ class Renderer:
         self._background: Any = None
 
     def draw(self, scene: Scene) -> np.ndarray | None:
-        """Draw a scene; one whose time goes back begins a new episode on the same path.
+        """Draw a scene; an earlier time than before starts a new episode on the same path.
 
-        Returns a fresh uint8 array ``(H, W, 3)`` in the mode ``"rgb_array"``, else None. Once closed,
-        nothing happens.
+        Returns a new uint8 array ``(H, W, 3)`` in the mode ``"rgb_array"``, else None. Does nothing after
+        :meth:`close`.
         """
         if self._window:
             self._handle_events()
@@ -159,7 +159,7 @@ class Renderer:
         return self._pixels()
 
     def close(self) -> None:
-        """Close the window. Drawing does nothing from now on."""
+        """Close the window; :meth:`draw` does nothing afterwards."""
         if self._open and self._window:
             self._pg.display.quit()
         self._open = False
@@ -212,7 +212,7 @@ class Renderer:
     # Memory
 
     def _remember(self, scene: Scene) -> None:
-        """Lengthen the trails: about ``TRAIL_POINTS`` points evenly in time, and the robots' place now."""
+        """Extend the trails: about ``TRAIL_POINTS`` points, equidistant in time, and the present positions."""
         places = np.stack([scene.x_mm, scene.y_mm], axis=-1)
         if not self._trail or scene.t_s < self._trail[-1][0]:
             self._trail.clear()
@@ -227,7 +227,7 @@ class Renderer:
     # Floor
 
     def _fit(self) -> View:
-        """The view of path and start: in the middle, or farther right, clear of the text."""
+        """The view of path and start: centred, or farther right beside the text."""
         room = MARGIN_RADII * max(robot.outline_radius_mm for robot in self._robots)
         low, high = self._path_mm.min(axis=0), self._path_mm.max(axis=0)
         start = self._start_mm[np.isfinite(self._start_mm).all(axis=-1)]
@@ -309,15 +309,15 @@ class Renderer:
                 draw(view, view.place(x_mm[i], y_mm[i], theta_rad[i]), scene, i)
 
     def _draw_trails(self, view: View) -> None:
-        """Thinner and paler the older; the youngest of all robots on top."""
+        """Older parts are thinner and paler; the newest parts of all robots are on top."""
         if len(self._trail) < 2:
             return
         points = np.stack([places for _, places in self._trail])
         age_s = self._trail[-1][0] - np.array([t_s for t_s, _ in self._trail])
-        youth = 1 - age_s / self._trail_s
-        shades = (youth[::BLOCK] * (len(self._faded) - 1)).astype(int).tolist()
+        recency = 1 - age_s / self._trail_s
+        shades = (recency[::BLOCK] * (len(self._faded) - 1)).astype(int).tolist()
         colours = [self._faded[shade] for shade in shades]
-        self._shapes.lines(view, points, TRAIL_PX * view.pen * youth, colours)
+        self._shapes.lines(view, points, TRAIL_PX * view.pen * recency, colours)
 
     def _draw_robot(self, view: View, body: Place, scene: Scene, number: int) -> None:
         robot, colour, pen = self._robots[number], self._colours[number], view.pen
@@ -350,19 +350,19 @@ class Renderer:
     def _draw_tyre(
         self, view: View, wheel: Place, width_mm: float, radius_mm: float, slip_mm_s: float
     ) -> None:
-        """A wheel from above; one that slips glows."""
+        """A wheel from above, with a coloured halo if it slips."""
         width, length = width_mm * view.scale, 2 * radius_mm * view.scale
         strength = 0.0
         if slip_mm_s > SLIP_SHOWN_MM_S:
             strength = min(0.45 + 0.55 * slip_mm_s / SLIP_FULL_MM_S, 1.0)
-            glow = 4.0 * view.pen
+            halo = 4.0 * view.pen
             self._shapes.bar(
-                wheel, (width + glow, length + glow), mixed(FLOOR, ALARM, 0.5 * strength)
+                wheel, (width + halo, length + halo), mixed(FLOOR, ALARM, 0.5 * strength)
             )
         self._shapes.bar(wheel, (width, length), mixed(TYRE, ALARM, strength))
 
     def _draw_treads(self, wheel: Place, radius_mm: float, angle: float) -> None:
-        """The marks on the upper side of a wheel, foreshortened; rolling moves them forwards."""
+        """Foreshortened marks on the upper side of a wheel; they move forward when it rolls."""
         for k in range(TREADS):
             turn = angle + 2 * math.pi * k / TREADS
             if math.cos(turn) > 0.3:
@@ -371,7 +371,7 @@ class Renderer:
                 self._shapes.bar(wheel.at(0, radius_mm * math.sin(turn)), size, TREAD)
 
     def _draw_ghost(self, view: View, body: Place, scene: Scene, number: int) -> None:
-        """The predecessor's outline one gap ago and a tick at its front, in the follower's colour."""
+        """The predecessor's outline one gap ago with a tick at its front, in the follower's colour."""
         robot, line = self._robots[number - 1], 1.3 * view.pen
         radius, offset = robot.outline_radius_mm, robot.outline_offset_mm
         self._shapes.ring(body.at(0, -offset), radius * view.scale, line, self._colours[number])
@@ -379,12 +379,12 @@ class Renderer:
         self._shapes.bar(front, (line, 0.2 * radius * view.scale), self._colours[number])
 
     def _draw_reference(self, view: View, place: Place, scene: Scene, number: int) -> None:
-        """A cross, its arms along the reference's axes."""
+        """A cross with arms along the reference's axes."""
         arm = ARM_RADII * self._robots[number].outline_radius_mm * view.scale
         self._shapes.cross(place, arm, 1.2 * view.pen, INK)
 
     def _draw_arrows(self, scene: Scene) -> None:
-        """An arrow and a name at the edge for every robot that is outside."""
+        """An arrow and a name at the edge for every robot outside the view."""
         view, pen = self._view, self._view.pen
         places = view.px(np.stack([scene.x_mm, scene.y_mm], axis=-1))
         size = np.array([view.width, view.height])
@@ -437,7 +437,7 @@ class Renderer:
         self._pg.draw.rect(self._canvas, mixed(FLOOR, INK, 0.5), view.rect, OVERSAMPLING)
 
     def _draw_legend(self) -> None:
-        """What the marks mean, under the close-up."""
+        """The legend under the close-up."""
         pen = self._view.pen
         x, y = (EDGE_PX + 8) * pen, self._view.height - (EDGE_PX + 2.3 * LINE_PX) * pen
         mark, below = Place(x, y, 0.0, 1.0), -LINE_PX * pen
@@ -469,7 +469,7 @@ class Renderer:
             self._write_robot(scene, i, top + i * LINE_PX * u)
 
     def _write_robot(self, scene: Scene, number: int, y: float) -> None:
-        """One line: colour, name, position error, time-gap error, what has happened."""
+        """One line: colour, name, position error, time-gap error, lost or touched."""
         u = self._text_unit
         x = EDGE_PX * u
         self._pg.draw.aacircle(self._picture, self._colours[number], (x + 5 * u, y + 6 * u), 5 * u)
@@ -490,13 +490,13 @@ class Renderer:
 
 
 def round_length(least: float) -> float:
-    """The smallest of 1, 2, 5, 10, 20 … that is at least this."""
+    """The smallest of 1, 2, 5, 10, 20 … that is at least ``least``."""
     power = 10.0 ** math.floor(math.log10(least))
     return next(digit * power for digit in (1, 2, 5, 10) if digit * power >= least)
 
 
 def _grid_lines(view: View, step_mm: float, phase: float) -> tuple[list[int], list[int]]:
-    """Where the lines x and y = (k + phase)·step lie on the canvas, at whole px of the picture."""
+    """Canvas coordinates of the lines x and y = (k + phase)·step, at whole px of the picture."""
     x_mm, y_mm = view.corner_mm
     columns = np.arange(math.floor(x_mm / step_mm), (x_mm + view.width / view.scale) / step_mm)
     rows = np.arange(

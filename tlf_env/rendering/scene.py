@@ -1,4 +1,4 @@
-"""What one frame shows of a formation."""
+"""The data of a formation that one frame shows."""
 
 from __future__ import annotations
 
@@ -9,13 +9,14 @@ import numpy as np
 from tlf_env.engine.formation import Formation
 from tlf_env.task.info import State
 
-STILL_MM = 1e-3  # who went less has no direction
+STILL_MM = 1e-3  # a smaller displacement has no direction
 
 
 class Scene(NamedTuple):
-    """Everything that one frame shows. A row of each array is a robot; units mm, rad, s.
+    """The data of one frame; arrays ``(robot,)`` in mm, rad, s.
 
-    Poses are those of the axle midpoint c; headings counter-clockwise from +y.
+    Poses are those of the axle midpoint c; headings counter-clockwise from +y (unlike ROS REP-103, where
+    heading 0 is +x).
     """
 
     t_s: float
@@ -28,7 +29,7 @@ class Scene(NamedTuple):
     reference_x_mm: np.ndarray  # each robot's own reference
     reference_y_mm: np.ndarray
     reference_theta_rad: np.ndarray
-    ghost_x_mm: np.ndarray  # the predecessor one gap ago; NaN where there is none
+    ghost_x_mm: np.ndarray  # the predecessor one gap ago; NaN if none
     ghost_y_mm: np.ndarray
     ghost_theta_rad: np.ndarray
     slip_l_mm_s: np.ndarray
@@ -41,7 +42,7 @@ class Scene(NamedTuple):
 
 
 def scene_of(formation: Formation) -> Scene:
-    """The scene of a formation as it is now: the truth, in fresh arrays."""
+    """The present scene of a formation: the true state, in new arrays."""
     motion, contact = formation.named("motion"), formation.named("contact")
     reference, info = formation.reference(), formation.info()
     state = dict(zip(State._fields, formation.state().T, strict=True))
@@ -73,7 +74,7 @@ def scene_of(formation: Formation) -> Scene:
 def _ghosts(formation: Formation, theta: np.ndarray) -> np.ndarray:
     """Pose of every robot's predecessor one gap ago, ``(3, robot)``.
 
-    Its heading is the direction it went; where it stood still, the one it has now.
+    Its heading is the direction of its motion, or its present heading if it was at rest.
     """
     ghosts = np.full((3, len(theta)), np.nan)
     step = formation.step_count - formation.scenario.gap_steps

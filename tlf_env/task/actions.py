@@ -1,4 +1,4 @@
-"""What an action means: four kinds, all in [−1, 1]², turned into wheel speeds or torques."""
+"""The four kinds of action, all in [−1, 1]², and their conversion to wheel speeds or torques."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tlf_env.task.observation import Entry, Preview, Tracking
 
 ACTION_SIZE = 2
 TWIST, WHEEL_SPEED, TORQUE, RESIDUAL = range(4)
-REFERENCE = 5  # no action of its own: the reference's twist takes its place
+REFERENCE = 5  # the twist of the reference controller instead of an action
 ActionKind = Literal["twist", "wheel_speed", "torque", "residual"]
 ACTION_KINDS: dict[ActionKind, int] = {
     "twist": TWIST,
@@ -34,25 +34,25 @@ FULL_RESIDUAL_RAD_S = 1.0
 
 ACTION_ENTRIES = {
     "twist": (
-        Entry("forward speed u₁ asked of the wheel loops", "mm/s", FULL_SPEED_MM_S),
-        Entry("yaw rate u₂, counter-clockwise", "rad/s", FULL_YAW_RATE_RAD_S),
+        Entry("commanded forward speed u₁", "mm/s", FULL_SPEED_MM_S),
+        Entry("commanded yaw rate u₂, counter-clockwise", "rad/s", FULL_YAW_RATE_RAD_S),
     ),
     "wheel_speed": (
-        Entry("speed of the left wheel asked of its loop", "rad/s", FULL_WHEEL_SPEED_RAD_S),
-        Entry("speed of the right wheel", "rad/s", FULL_WHEEL_SPEED_RAD_S),
+        Entry("commanded speed of the left wheel", "rad/s", FULL_WHEEL_SPEED_RAD_S),
+        Entry("commanded speed of the right wheel", "rad/s", FULL_WHEEL_SPEED_RAD_S),
     ),
     "torque": (
-        Entry("torque on the left wheel, past the wheel loop", "N·mm", FULL_TORQUE_NMM),
+        Entry("torque on the left wheel, without wheel loop", "N·mm", FULL_TORQUE_NMM),
         Entry("torque on the right wheel", "N·mm", FULL_TORQUE_NMM),
     ),
     "residual": (
         Entry(
-            "forward speed added to what residual_base asks for, before its limits; "
-            "residual_fade_mm and residual_reach_mm fade it out",
+            "forward speed added to the command of the controller residual_base, before its limits; "
+            "residual_fade_mm and residual_reach_mm reduce it",
             "mm/s",
             FULL_RESIDUAL_MM_S,
         ),
-        Entry("yaw rate added to it", "rad/s", FULL_RESIDUAL_RAD_S),
+        Entry("yaw rate added to that command", "rad/s", FULL_RESIDUAL_RAD_S),
     ),
 }
 
@@ -82,7 +82,7 @@ def clipped_action(component: float) -> float:
 def wanted_twist(
     observation: np.ndarray, scales: np.ndarray, row: ControllerRow
 ) -> tuple[float, float]:
-    """The tracking law, eqs (16)–(21), from one ``tracking`` observation: a twist in mm/s, rad/s."""
+    """Twist (mm/s, rad/s) of the tracking law, eqs (16)–(21), from one ``tracking`` observation."""
     u_1, u_2 = observation[U_1] * scales[U_1], observation[U_2] * scales[U_2]
     if row.lead > 0.0:
         u_1 += row.lead * (observation[LATER_U_1] * scales[LATER_U_1] - u_1)
@@ -103,7 +103,7 @@ def wanted_twist(
 
 @law
 def received_predecessor(observation: np.ndarray, scales: np.ndarray) -> Predecessor:
-    """The predecessor as one ``tracking`` observation tells of it."""
+    """The predecessor from one ``tracking`` observation."""
     i = PREDECESSOR
     return Predecessor(
         observation[i] * scales[i],
@@ -119,7 +119,7 @@ def received_predecessor(observation: np.ndarray, scales: np.ndarray) -> Predece
 def twist_action(
     observation: np.ndarray, scales: np.ndarray, row: ControllerRow, u_1: float, u_2: float
 ) -> tuple[float, float]:
-    """The ``twist`` action that asks the wheels for a twist (mm/s, rad/s), within the limits."""
+    """The ``twist`` action that commands a twist (mm/s, rad/s), within the limits."""
     u_1 = max(u_1, -row.limits.reverse)
     if row.spacing.distance > 0.0 and observation[IS_LEADER] * scales[IS_LEADER] < 0.5:
         u_1, u_2 = spaced_twist(u_1, u_2, received_predecessor(observation, scales), row.spacing)
@@ -141,18 +141,18 @@ def twist_action(
 def reference_action(
     observation: np.ndarray, scales: np.ndarray, row: ControllerRow
 ) -> tuple[float, float]:
-    """The reference's ``twist`` action from one ``tracking`` observation."""
+    """The ``twist`` action of the reference controller from one ``tracking`` observation."""
     u_1, u_2 = wanted_twist(observation, scales, row)
     return twist_action(observation, scales, row, u_1, u_2)
 
 
 @law
 def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float, reach: float) -> float:
-    """How much of a residual counts at the estimated error e: e/(e + fade) · reach⁴/(e⁴ + reach⁴); mm.
+    """Weight of a residual at the estimated error e (mm): e/(e + fade) · reach⁴/(e⁴ + reach⁴).
 
-    Near its reference and far from it a robot is driven by the base alone. Near, a residual is no more
-    than a change of gain, and a small bias in it leaves no error behind; far, the base is known to come
-    back. Everything counts if ``fade`` is 0 and ``reach`` infinite.
+    A residual is an action added to a base controller's twist. Near the reference and far from it the base
+    controller acts alone. Near, a residual then only changes the gain, and its bias causes no steady error;
+    far, the base controller is known to return. The weight is 1 if ``fade`` is 0 and ``reach`` infinite.
     """
     if fade == 0.0 and reach == math.inf:
         return 1.0
@@ -166,7 +166,7 @@ def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float, rea
 
 @law
 def wheel_command(a_0: float, a_1: float, kind: int, body: Body) -> tuple[float, float]:
-    """Wheel speeds (left, right; rad/s) that a ``twist`` or ``wheel_speed`` action asks for."""
+    """Wheel speeds (left, right; rad/s) that a ``twist`` or ``wheel_speed`` action commands."""
     if kind == WHEEL_SPEED:
         return a_0 * FULL_WHEEL_SPEED_RAD_S, a_1 * FULL_WHEEL_SPEED_RAD_S
     return wheel_speeds(a_0 * FULL_SPEED_MM_S, a_1 * FULL_YAW_RATE_RAD_S, body)

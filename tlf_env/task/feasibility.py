@@ -1,7 +1,7 @@
-"""What a reference trajectory asks of the robots beyond what they can do, in words.
+"""Warnings for reference trajectories that the robots cannot follow.
 
 The limits follow from :class:`~tlf_env.physics.vehicle.RobotParameters`; ``docs/trajectories.md``
-derives them. They are for warnings: a scenario that breaks them still runs.
+derives them. A scenario that exceeds them still runs.
 """
 
 from __future__ import annotations
@@ -19,36 +19,36 @@ from tlf_env.task.trajectories import Trajectory, sample
 
 SAMPLE_S = 0.01
 MAX_SAMPLES = 200_000
-STANDS_MM_S = 0.1
-STANDS_S = 0.1  # a shorter stand is an instant of turning back or of starting
-NEAR_WORST = 1e-3  # the first place that is as bad as the worst, but for this share, is told
-NAMED = 6  # at most, of the distances at which robots meet
-RATE_S = 0.1  # a robot may take so long over a change of speed or of yaw rate
-TURNS_RAD_S = 0.01  # slower, the castor need not swing
-SPOT_MM = 1.0  # a turn within a sample that travels less than this is on the spot
-# What the observation `sensor` can tell before it is clipped.
+REST_MM_S = 0.1
+REST_S = 0.1  # a shorter rest is an instant of reversing or starting
+NEAR_WORST = 1e-3  # the first value within this share of the largest is reported
+NAMED = 6  # largest number of robot pairs in a warning
+RATE_S = 0.1  # time that a robot may take for a change of speed or yaw rate
+TURNS_RAD_S = 0.01  # at slower yaw rates the castor need not swing
+SPOT_MM = 1.0  # a turn is on the spot if less is travelled within a sample
+# Limits beyond which the observation `sensor` is clipped.
 SENSOR_FIX_LIMIT_MM = OBSERVATION_LIMIT * SAMPLE_ENTRIES["fix_x"].scale
 SENSOR_START_LIMIT_MM = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["start_x"].scale
 SENSOR_TIME_LIMIT_S = OBSERVATION_LIMIT * SENSOR_TAIL_ENTRIES["time"].scale
 
 
 def motor_acceleration(robot: RobotParameters) -> float:
-    """The largest forward acceleration that the motors give on a straight, joints rubbing, mm/s²."""
+    """Largest forward acceleration by the motors on a straight, with joint friction, mm/s²."""
     idle, per_acceleration = (_motor_torque(robot, 0.0, 0.0, a, 0.0) for a in (0.0, 1.0))
     return float((robot.torque_limit_Nmm - idle) / (per_acceleration - idle))
 
 
 def grip_acceleration(robot: RobotParameters) -> tuple[float, float]:
-    """What the drive wheels' tyres hold (static) and, once they slip, give (dynamic), mm/s².
+    """Accelerations at the static and the dynamic friction of the drive wheels' tyres, mm/s².
 
-    The castor is left out: it swivels, and sideways gives no more than its steering friction does.
+    The castor is neglected: it swivels, and its lateral force is limited by the steering friction.
     """
     carried = 2 * robot.drive_load_share * robot.gravity_mm_s2
     return robot.tyre.mu_static * carried, robot.tyre.mu_dynamic * carried
 
 
 def disturbed(robot: RobotParameters, friction_scale: float, torque_gain: float) -> RobotParameters:
-    """The robot with its tyres' friction and its motors' torque scaled by factors, each at least 0."""
+    """The robot with tyre friction and motor torque scaled by factors, each at least 0."""
     tyre = robot.tyre.model_copy(
         update={
             "mu_static": friction_scale * robot.tyre.mu_static,
@@ -69,8 +69,8 @@ def _motor_torque(
 ) -> np.ndarray:
     """The larger torque (N·mm) of the two motors for a motion without slip.
 
-    Forward: m_eff·u̇₁ + m·d·u₂² + castor's axle; yaw about c: I·u̇₂ − m·d·u₁·u₂ and, in a turn, all
-    that the castor's steering friction resists; joints by eq. (5), u₁·u₂ at most what the tyres hold.
+    Forward: m_eff·u̇₁ + m·d·u₂² + castor's axle; yaw about c: I·u̇₂ − m·d·u₁·u₂ plus, in a turn, the
+    castor's steering friction; joints by eq. (5), with u₁·u₂ limited to the static grip.
     """
     row = body(robot)
     u_1, u_2 = np.asarray(u_1), np.asarray(u_2)
@@ -99,18 +99,18 @@ def _motor_torque(
 
 
 def start_note(trajectory: Trajectory, robot: RobotParameters) -> str | None:
-    """What it means that the robots start at rest, where the reference does not; else None.
+    """A note on a reference that does not start at rest, as the robots do; else None.
 
-    A note and no warning: the paper's own trajectories start at speed.
+    It is no warning: the paper's trajectories start at speed.
     """
     u_1 = float(sample(trajectory, np.array([0.0]))[0, 3])
-    if u_1 <= STANDS_MM_S:
+    if u_1 <= REST_MM_S:
         return None
     limit = motor_acceleration(robot)
     if limit <= 0:
         return (
-            f"the reference starts at {u_1:.0f} mm/s and the robots at rest: "
-            f"{robot.torque_limit_Nmm:g} N·mm do not move the leader"
+            f"the reference starts at {u_1:.0f} mm/s and the robots at rest: a torque of "
+            f"{robot.torque_limit_Nmm:g} N·mm does not move the leader"
         )
     return (
         f"the reference starts at {u_1:.0f} mm/s and the robots at rest: at full torque "
@@ -128,17 +128,16 @@ def warnings_for(
     time_gap_s: float = 5.0,
     start_spacing_mm: float = 300.0,
 ) -> list[str]:
-    """A line for each thing that the reference asks within the horizon and a robot cannot do.
+    """A line for each limit of the robots that the reference exceeds within the horizon.
 
-    Looked at every 10 ms (or less often over more than half an hour): standing still, speed, yaw
-    rate, turning on the spot, the motors' torque, the tyres' grip, and the distance between robots
-    that follow one ``time_gap_s`` apart, lined up ``start_spacing_mm`` apart at the start. Each line
-    names the worst place, the value and the limit.
+    Checked every 10 ms (less often for more than half an hour): rest, speed, yaw rate, turns on the spot,
+    motor torque, grip of the tyres, and the distance between robots that follow one ``time_gap_s`` apart
+    and start ``start_spacing_mm`` apart. Each line gives the worst place, the value and the limit.
     """
     t_s, gap_steps = _times(horizon_s, time_gap_s)
     reference = sample(trajectory, t_s)
     return [
-        *_stands(t_s, reference),
+        *_rests(t_s, reference),
         *_speed(t_s, reference),
         *_turning(t_s, reference),
         *_motors(t_s, reference, robot),
@@ -155,12 +154,11 @@ def sensor_warnings(
     time_gap_s: float = 5.0,
     start_spacing_mm: float = 300.0,
 ) -> list[str]:
-    """A line for each thing within the horizon that the observation ``sensor`` clips in silence.
+    """A line for each quantity that the observation ``sensor`` clips within the horizon.
 
-    Position fixes and messages count from a robot's own start and are clipped at ±10 m per
-    coordinate; so are the start's coordinates in the world, and ``time`` at 1000 s. Robot i drives
-    what the reference drives until i gaps before the horizon. Each line names the first place, the
-    value and the limit.
+    Position fixes and messages are relative to a robot's own start and clipped at ±10 m per coordinate, as
+    are the start's coordinates in the world; ``time`` is clipped at 1000 s. Robot i follows the reference
+    up to i gaps before the horizon. Each line gives the first place, the value and the limit.
     """
     t_s, gap_steps = _times(horizon_s, time_gap_s)
     reference = sample(trajectory, t_s)
@@ -187,7 +185,7 @@ def _far_starts(starts: np.ndarray) -> Iterator[str]:
 def _far_places(
     t_s: np.ndarray, reference: np.ndarray, starts: np.ndarray, gap_steps: int
 ) -> Iterator[str]:
-    """Per robot by the extremes so far: a robot behind drives a shorter part of the same path."""
+    """From running extremes: a robot farther behind drives a shorter part of the same path."""
     places = reference[:, :2]
     low, high = np.minimum.accumulate(places), np.maximum.accumulate(places)
     last = len(t_s) - 1 - gap_steps * np.arange(len(starts))
@@ -206,20 +204,20 @@ def _far_places(
 
 
 def _and_more(far: np.ndarray) -> str:
-    """How many robots are concerned, if more than one."""
+    """The number of robots, if more than one."""
     return f" ({np.count_nonzero(far)} robots in all)" if np.count_nonzero(far) > 1 else ""
 
 
 def _long_horizon(horizon_s: float) -> Iterator[str]:
     if horizon_s > SENSOR_TIME_LIMIT_S:
         yield (
-            f"t = {SENSOR_TIME_LIMIT_S:.0f} s: observation 'sensor' clips time there; the horizon is "
-            f"{horizon_s:g} s"
+            f"t = {SENSOR_TIME_LIMIT_S:.0f} s: observation 'sensor' clips time at this value; the "
+            f"horizon is {horizon_s:g} s"
         )
 
 
 def _times(horizon_s: float, time_gap_s: float) -> tuple[np.ndarray, int]:
-    """Times (s) to look at, and how many of them make a gap: 10 ms apart, more over long horizons."""
+    """Times (s) to check and their number per gap: 10 ms apart, more for long horizons."""
     gap_steps = math.ceil(time_gap_s / max(SAMPLE_S, horizon_s / MAX_SAMPLES))
     step_s = time_gap_s / gap_steps
     t_s = np.arange(math.floor(horizon_s / step_s + 1e-9) + 1) * step_s
@@ -236,12 +234,12 @@ def _first(flags: np.ndarray) -> int:
 
 
 def _worst(values: np.ndarray) -> int:
-    """The first place of about the largest value."""
+    """Index of the first value that is about the largest."""
     return _first(values >= (1 - NEAR_WORST) * values.max())
 
 
 def _rate(t_s: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Rate of change over ``RATE_S`` around each time: a jump counts by what is left of it then."""
+    """Rate of change over ``RATE_S`` around each time, so that a jump gives a finite rate."""
     half = max(round(RATE_S / 2 / (t_s[1] - t_s[0])), 1)
     k = np.arange(len(t_s))
     before, after = np.maximum(k - half, 0), np.minimum(k + half, len(t_s) - 1)
@@ -254,18 +252,18 @@ def _runs(flags: np.ndarray) -> np.ndarray:
     return edges.reshape(-1, 2) - [0, 1]
 
 
-def _stands(t_s: np.ndarray, reference: np.ndarray) -> Iterator[str]:
-    """Assumption 2: u₁* and u₂* are not zero at once, until the end."""
+def _rests(t_s: np.ndarray, reference: np.ndarray) -> Iterator[str]:
+    """Assumption 2: u₁* and u₂* are not both zero before the end."""
     runs = [
         (a, b)
-        for a, b in _runs(reference[:, 3] < STANDS_MM_S)
-        if b < len(t_s) - 1 and t_s[b] - t_s[a] >= STANDS_S
+        for a, b in _runs(reference[:, 3] < REST_MM_S)
+        if b < len(t_s) - 1 and t_s[b] - t_s[a] >= REST_S
     ]
     if runs:
         a, b = runs[0]
         more = f" ({len(runs)} times in all)" if len(runs) > 1 else ""
         yield (
-            f"{_place(t_s, reference, a)}: the reference stands still until t = {t_s[b]:.2f} s{more}; "
+            f"{_place(t_s, reference, a)}: the reference is at rest until t = {t_s[b]:.2f} s{more}; "
             "the tracking law assumes that u_1 and u_2 are never both 0 before the end (assumption 2)"
         )
 
@@ -275,12 +273,12 @@ def _speed(t_s: np.ndarray, reference: np.ndarray) -> Iterator[str]:
     if reference[k, 3] > FULL_SPEED_MM_S:
         yield (
             f"{_place(t_s, reference, k)}: speed {reference[k, 3]:.0f} mm/s is above "
-            f"{FULL_SPEED_MM_S:g} mm/s, the most that a robot can be asked for"
+            f"{FULL_SPEED_MM_S:g} mm/s, the largest speed command"
         )
 
 
 def _turning(t_s: np.ndarray, reference: np.ndarray) -> Iterator[str]:
-    """Yaw rates above the limit, by the change of heading from sample to sample."""
+    """Yaw rates above the limit, from the change of heading between samples."""
     turn = np.diff(reference[:, 2])
     rate = turn / (t_s[1] - t_s[0])
     travel = np.hypot(*np.diff(reference[:, :2], axis=0).T)
@@ -299,7 +297,7 @@ def _turning(t_s: np.ndarray, reference: np.ndarray) -> Iterator[str]:
     if moving[k] > 0:
         yield (
             f"{_place(t_s, reference, k)}: yaw rate {moving[k]:.1f} rad/s is above "
-            f"{FULL_YAW_RATE_RAD_S:g} rad/s, the most that a robot can be asked for"
+            f"{FULL_YAW_RATE_RAD_S:g} rad/s, the largest yaw rate command"
         )
 
 
@@ -312,7 +310,7 @@ def _motors(t_s: np.ndarray, reference: np.ndarray, robot: RobotParameters) -> I
         yield (
             f"{_place(t_s, reference, k)}: changing speed by {acceleration[k]:.0f} mm/s² and yaw rate "
             f"by {yaw_acceleration[k]:.2g} rad/s² needs {torque[k]:.1f} N·mm of a motor, above "
-            f"{robot.torque_limit_Nmm:g} (on a straight they give "
+            f"{robot.torque_limit_Nmm:g} (on a straight the motors give "
             f"{max(motor_acceleration(robot), 0.0):.0f} mm/s²)"
         )
 
@@ -322,13 +320,16 @@ def _grip(t_s: np.ndarray, reference: np.ndarray, robot: RobotParameters) -> Ite
     motors = max(motor_acceleration(robot), 0.0)
     along = np.clip(_rate(t_s, reference[:, 3]), -motors, motors)
     total = np.hypot(lateral, along)
-    holds, gives = grip_acceleration(robot)
+    static, dynamic = grip_acceleration(robot)
     k = _worst(total)
-    if total[k] > gives:
-        if total[k] > holds:
-            limit = f"{holds:.0f} mm/s², where the drive wheels break loose"
+    if total[k] > dynamic:
+        if total[k] > static:
+            limit = f"{static:.0f} mm/s², the static grip limit of the drive wheels"
         else:
-            limit = f"{gives:.0f} mm/s²; up to {holds:.0f} they hold, but a slip will not end there"
+            limit = (
+                f"{dynamic:.0f} mm/s², the dynamic grip limit of the drive wheels; up to the static "
+                f"limit, {static:.0f} mm/s², they hold, but a slip does not end"
+            )
         yield (
             f"{_place(t_s, reference, k)}: acceleration {total[k]:.0f} mm/s² "
             f"({abs(lateral[k]):.0f} of it sideways) is above {limit}"
@@ -345,8 +346,8 @@ def _meetings(
 ) -> Iterator[str]:
     """Distances between the outlines' centres of robots i gaps apart.
 
-    A robot that has not set out yet waits in the line behind the start, and moves up one place per
-    gap: as if the reference had come along that line.
+    Before its start a robot is in the line behind the start and moves up one place per gap, as if the
+    reference had come along that line.
     """
     theta = reference[:, 2]
     ahead = np.stack([-np.sin(theta), np.cos(theta)], axis=1)
@@ -366,8 +367,9 @@ def _meetings(
         distance_mm, i, k = min(found)
         others = sorted(other for _, other, _ in found if other != i)
         names = ", ".join(str(other) for other in others[:NAMED]) + ", …" * (len(others) > NAMED)
-        more = f"; robots {names} apart come too close as well" if others else ""
+        more = f"; pairs {names} positions apart are too close as well" if others else ""
         yield (
             f"{_place(t_s, reference, k)}: robot_0 and robot_{i} are {distance_mm:.0f} mm apart, below "
-            f"{room_mm:.0f} mm, two outline radii; so is every pair {i} apart, each a gap later{more}"
+            f"{room_mm:.0f} mm, two outline radii; the same holds for every pair {i} positions apart, "
+            f"one gap later each{more}"
         )

@@ -1,4 +1,4 @@
-"""True errors of one robot, measured and not commanded."""
+"""True errors of one robot."""
 
 from __future__ import annotations
 
@@ -9,12 +9,12 @@ import numpy as np
 from tlf_env.numerics.compiled import law
 
 TIME_GAP_WINDOW_S = 2.0
-ROUNDING_MM = 1e-6  # more than distances of this size can be wrong by
+ROUNDING_MM = 1e-6  # above the rounding error of a distance
 
 
 @law
 def distance(x_a: float, y_a: float, x_b: float, y_b: float) -> float:
-    """Distance of two points, mm."""
+    """Distance between two points, mm."""
     return math.sqrt((x_a - x_b) ** 2 + (y_a - y_b) ** 2)
 
 
@@ -22,7 +22,7 @@ def distance(x_a: float, y_a: float, x_b: float, y_b: float) -> float:
 def nearest_on_segment(
     x: float, y: float, x_a: float, y_a: float, x_b: float, y_b: float
 ) -> tuple[float, float]:
-    """Fraction along the segment a–b of its point nearest to (x, y), and the squared distance to it."""
+    """The point of the segment a–b nearest to (x, y): fraction along the segment, and squared distance."""
     d_x, d_y = x_b - x_a, y_b - y_a
     length_2 = d_x * d_x + d_y * d_y
     along = (x - x_a) * d_x + (y - y_a) * d_y
@@ -42,12 +42,12 @@ def time_gap_error(
     period_s: float,
     longest: float,
 ) -> float:
-    """How much later than one gap ago the predecessor passed where the follower is now, s.
+    """Time since the predecessor passed the follower's position, minus the time gap, s.
 
-    ``path[axis, slot]`` is a ring of the predecessor's true positions, one per control step; the
-    nearest point of it within ±``window_steps`` of one gap ago is taken. Positive: the follower is
-    late. 0 while the predecessor has no past of one gap. ``longest`` bounds the way between two
-    neighbours in the ring, mm: what is too far away to be nearest is passed over.
+    ``path[axis, slot]`` is a ring of the predecessor's true positions, one per control step; the nearest
+    point within ±``window_steps`` of one gap ago is used. Positive: the follower is late. 0 until one gap
+    has passed. ``longest`` is an upper bound on the distance between neighbours in the ring, mm; it allows
+    skipping points that are too far away to be the nearest.
     """
     if step < gap_steps:
         return 0.0
@@ -59,12 +59,12 @@ def time_gap_error(
     a = max(min(step - gap_steps, last - 1), first) % slots
     b = a + 1 if a + 1 < slots else 0
     _, squared = nearest_on_segment(x, y, path[0, a], path[1, a], path[0, b], path[1, b])
-    within = math.sqrt(squared) + ROUNDING_MM  # where the nearest point lies
+    within = math.sqrt(squared) + ROUNDING_MM  # upper bound on the smallest distance
     best, best_step = math.inf, 0.0
     k, a = first, first % slots
     while k < last:
         spare = distance(x, y, path[0, a], path[1, a]) - within
-        if spare > longest:  # the next segments all lie farther away
+        if spare > longest:  # the next segments are farther away
             passed = int(min(spare / longest, 1.0 * (last - k))) if longest > 0.0 else last - k
             k, a = k + passed, (a + passed) % slots
         else:

@@ -1,4 +1,4 @@
-"""What a run is summed up by; definitions with formulas in ``docs/metrics.md``."""
+"""Metrics of a run; definitions with formulas in ``docs/metrics.md``."""
 
 from __future__ import annotations
 
@@ -18,18 +18,18 @@ SETTLED_MM = 20.0  # settling time: the position error stays below this
 
 
 class RobotMetrics(NamedTuple):
-    """One robot's summary; None where a value is undefined."""
+    """Metrics of one robot; None if a value is undefined."""
 
-    position_rmse_mm: float | None  # to the robot's own reference, from settle_s on
+    position_rmse_mm: float | None  # to the robot's reference, from settle_s on
     position_max_mm: float | None
-    cross_track_rmse_mm: float | None  # the part of the error across the reference's heading
+    cross_track_rmse_mm: float | None  # of the error across the reference's heading
     along_track_rmse_mm: float | None
     formation_rmse_mm: float | None  # to ref(t − i·gap), from t ≥ i·gap + 5 s on
-    settled_formation_rmse_mm: float | None  # the same from settle_s on
-    error_capped_mean_mm: float  # mean over the whole run of min(position error, 500)
+    settled_formation_rmse_mm: float | None  # from settle_s on
+    error_capped_mean_mm: float  # mean of min(position error, 500) over the whole run
     heading_rmse_rad: float | None
     time_gap_rmse_s: float | None  # followers only
-    settling_time_s: float | None  # from when on the position error stays below 20 mm
+    settling_time_s: float | None  # after it the position error stays below 20 mm
     J_mm_s: float  # eq. (54) at the end
     J_theta_rad_s: float
     torque_rms_Nmm: float
@@ -44,7 +44,7 @@ class RobotMetrics(NamedTuple):
 
 
 def rms(values: np.ndarray) -> float | None:
-    """Root mean square, None of nothing."""
+    """Root mean square; None for an empty array."""
     return float(np.sqrt(np.mean(np.square(values)))) if values.size else None
 
 
@@ -57,9 +57,9 @@ def robot_metrics(
 ) -> list[RobotMetrics]:
     """Metrics of every robot from a run's columns, each ``(time, robot)``.
 
-    ``lost_at_s`` and ``touched_at_s`` ``(robot,)`` tell when a robot's error first passed
-    ``lost_beyond_mm`` and when it first touched another, infinity if never. A robot is also lost if
-    its RMS over the last 30 % is above 100 mm.
+    ``lost_at_s`` and ``touched_at_s`` ``(robot,)`` are the times at which a robot's error first exceeded
+    ``lost_beyond_mm`` and at which it first touched another robot, infinity if never. A robot also counts
+    as lost if its RMS error over the last 30 % of the run is above 100 mm.
     """
     settled = t_s >= scenario.settle_s
     tail = t_s >= (1 - LOST_TAIL_FRACTION) * scenario.horizon_s
@@ -103,7 +103,7 @@ def robot_metrics(
 
 
 def track_errors(columns: Mapping[str, np.ndarray], robot: int) -> tuple[np.ndarray, np.ndarray]:
-    """Error of robot ``robot`` along and across its reference's heading, robot − reference, mm."""
+    """Error of a robot along and across its reference's heading, robot − reference, mm."""
     d_x = columns["x_mm"][:, robot] - columns["reference_x_mm"][:, robot]
     d_y = columns["y_mm"][:, robot] - columns["reference_y_mm"][:, robot]
     theta = columns["reference_theta_rad"][:, robot]
@@ -112,7 +112,7 @@ def track_errors(columns: Mapping[str, np.ndarray], robot: int) -> tuple[np.ndar
 
 
 def settling_time_s(t_s: np.ndarray, error: np.ndarray) -> float | None:
-    """The time from which on the error stays below 20 mm; None if it does not."""
+    """The time after which the error stays below 20 mm; None if it does not."""
     outside = np.flatnonzero(error >= SETTLED_MM)
     if not outside.size:
         return float(t_s[0])
@@ -120,13 +120,13 @@ def settling_time_s(t_s: np.ndarray, error: np.ndarray) -> float | None:
 
 
 def score(t_s: np.ndarray, formation_error_mm: np.ndarray, end_s: float) -> float:
-    """100 × mean over time of 1/(1 + formation error/10 mm), 0 from the moment of lost or touched."""
+    """100 × mean over time of 1/(1 + formation error/10 mm), 0 from when the robot is lost or touches."""
     points = 1 / (1 + formation_error_mm / SCORE_UNIT_MM)
     return float(100 * np.where(t_s < end_s, points, 0.0).mean())
 
 
 def nearest_mm(columns: Mapping[str, np.ndarray]) -> list[float | None]:
-    """Each robot's smallest distance to another, between axle midpoints; None if alone."""
+    """Smallest distance of each robot to another, between axle midpoints; None for a single robot."""
     x, y = columns["x_mm"], columns["y_mm"]
     robots = x.shape[1]
     if robots == 1:
@@ -140,32 +140,32 @@ def nearest_mm(columns: Mapping[str, np.ndarray]) -> list[float | None]:
 
 
 class StringMetrics(NamedTuple):
-    """How errors grow along the string, worst pair of neighbours; None where undefined.
+    """Amplification of errors along the string, for the worst pair of neighbours; None if undefined.
 
-    A gain up to 1 means that no follower makes more of its predecessor's error.
+    A gain of at most 1 means that no follower amplifies its predecessor's error.
     """
 
     time_gain: (
         float | None
-    )  # largest ratio of a follower's RMS deviation across the path to its predecessor's
+    )  # largest ratio of RMS deviations across the path, follower to predecessor
     frequency_gain: float | None  # largest gain of the error's spectrum between neighbours
-    frequency_Hz: float | None  # where that is
+    frequency_Hz: float | None  # frequency of that gain
 
 
 MIN_COHERENCE = 0.5
-MAX_FREQUENCY_HZ = 1.0  # above, the errors are sensor noise
+MAX_FREQUENCY_HZ = 1.0  # above it the errors are sensor noise
 SEGMENT_S = 20.0
 
 
 def string_metrics(
     scenario: Scenario, columns: Mapping[str, np.ndarray], leader: np.ndarray
 ) -> StringMetrics:
-    """String stability: deviations from the leader's reference path, across it, robot against robot.
+    """String stability: lateral deviations from the leader's reference path, compared between neighbours.
 
-    ``leader`` ``(time, 2)`` is the leader's reference, mm. Robot i's deviation at t is taken from
-    ref(t − i·gap), and compared with its predecessor's at t − gap: the same place of the path. The
-    frequency gain is |S_xy|/S_xx (Welch, 20 s segments) up to 1 Hz where the coherence is at least
-    0.5. Counted from ``settle_s`` on.
+    ``leader`` ``(time, 2)`` is the leader's reference, mm. Robot i's deviation at t refers to
+    ref(t − i·gap), and is compared with its predecessor's at t − gap, at the same point of the path. The
+    frequency gain is |S_xy|/S_xx (Welch, 20 s segments) at frequencies up to 1 Hz with a coherence of at
+    least 0.5. From ``settle_s`` on.
     """
     from scipy.signal import coherence, csd, welch
 
@@ -201,7 +201,7 @@ def string_metrics(
 def deviation_mm(
     columns: Mapping[str, np.ndarray], leader: np.ndarray, robot: int, lag: int
 ) -> np.ndarray:
-    """Signed distance of a robot across the leader's path, by the path's own time, ``(time − lag,)``."""
+    """Signed lateral distance of a robot from the leader's path ``lag`` steps earlier, ``(time − lag,)``."""
     x, y = columns["x_mm"][lag:, robot], columns["y_mm"][lag:, robot]
     path = leader[: len(x)]
     if len(path) < 2:

@@ -1,4 +1,4 @@
-"""The named terms of the reward; each is logged, and each has a weight of its own."""
+"""The terms of the reward; each is logged and has its own weight."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ REWARD_MEANINGS = {
     "fine": "e^(−e/2 mm)",
     "action_change": "|Δa|², a in units of the action space",
     "action_size": "|a|²",
-    "slip": "largest slip speed of a drive wheel in the step, in units of 100 mm/s",
+    "slip": "largest slip speed of a drive wheel in the step, in 100 mm/s",
     "lost": "1 in the step in which the robot is lost",
-    "touched": "1 in the step in which it first touches another",
+    "touched": "1 in the step in which the robot first touches another",
 }
 
 DEFAULT_WEIGHTS = RewardTerms(

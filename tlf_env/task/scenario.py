@@ -1,4 +1,4 @@
-"""The scenario: one frozen, validated model of everything that an episode depends on but its seed."""
+"""The scenario: a frozen, validated model of everything that an episode depends on, except the seed."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ MAX_ROBOTS = 1000
 DEFAULT_CONTROL_PERIOD_S = 0.02
 DEFAULT_PREVIEW_S = (0.5, 1.0)
 SETTLE_FRACTION = 0.4
-START_MARGIN_MM = 1.0  # between outlines at the start
+START_MARGIN_MM = 1.0  # smallest distance between outlines at the start
 DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
 NOT_IN_NAMES = re.compile(r"^[^\w]+|[^\w.+-]")
@@ -61,11 +61,11 @@ PartPath = Annotated[str, AfterValidator(_part_path)]
 
 
 class FrozenDict(dict[str, float]):
-    """A dictionary that refuses to change."""
+    """An immutable dictionary."""
 
     def _refuse(self, *_: Any, **__: Any) -> NoReturn:
         raise TypeError(
-            "a scenario never changes; make another one with load_scenario(scenario, ...)"
+            "a scenario is immutable; make a changed copy with load_scenario(scenario, ...)"
         )
 
     __setitem__ = __delitem__ = __ior__ = _refuse
@@ -81,20 +81,20 @@ def _disturbance_preset(name: str) -> dict[str, Any]:
 
 
 def whole_steps(duration_s: float, period_s: float) -> int | None:
-    """How many periods a duration is, or None if that is no whole number."""
+    """The number of periods in a duration, or None if it is not a whole number."""
     steps = round(duration_s / period_s)
     return steps if abs(steps * period_s - duration_s) <= DIVIDES_TOLERANCE * duration_s else None
 
 
 class Scenario(Frozen):
-    """Task, robots, onboard stack, disturbance, interface and end of an episode. Times in s."""
+    """Task, robots, onboard software, disturbance, interface and end of an episode. Times in s."""
 
     name: str = "custom"
     trajectory: Trajectory
     robots: (
         Annotated[int, Field(ge=1, le=MAX_ROBOTS)]
         | Annotated[tuple[RobotParameters, ...], Field(min_length=1, max_length=MAX_ROBOTS)]
-    ) = 3  # how many, or each one's parameters where they differ from `robot`
+    ) = 3  # number of robots, or the parameters of each that differ from `robot`
     robot: RobotParameters = RobotParameters()
     time_gap_s: Positive = 5.0
     start_spacing_mm: Annotated[Positive, Field(le=MAX_MAGNITUDE)] = 300.0
@@ -111,12 +111,13 @@ class Scenario(Frozen):
     observer: ObserverParameters | PartPath = ObserverParameters()
 
     disturbance: Disturbance = Disturbance()
-    adversary: bool = False  # whether something outside may set channels at every step
+    adversary: bool = False  # whether a caller may set disturbance channels at every step
 
     action: ActionKind = "twist"
-    residual_base: str = "consistent"  # controller that a residual is added to, a preset
-    # Estimated errors at which a residual counts half: it fades out below the first and beyond the
-    # second. 0 and None: it does not.
+    # Controller to whose twist a residual is added: a preset or a file.
+    residual_base: str = "consistent"
+    # Estimated errors at which a residual has half its weight: the weight decreases below the first and
+    # above the second. 0 and None: it does not.
     residual_fade_mm: NonNegative = 0.0
     residual_reach_mm: Positive | None = None
     observation: Literal["tracking", "sensor"] = "tracking"
@@ -125,14 +126,14 @@ class Scenario(Frozen):
     reward: dict[str, FiniteFloat] = Field(
         default_factory=lambda: FrozenDict(DEFAULT_WEIGHTS._asdict())
     )
-    cooperative: bool = False  # every robot gets the formation's mean reward
+    cooperative: bool = False  # every robot receives the formation's mean reward
     end_on: tuple[EndCondition, ...] = ("lost", "touched")
     lost_beyond_mm: Positive = 1200.0
 
     @model_validator(mode="before")
     @classmethod
     def _different_robots(cls, data: Any) -> Any:
-        """Let a robot be told by what differs: from the defaults, and each one from ``robot``."""
+        """Complete robots that are given by their differences: from the defaults, or from ``robot``."""
         if not isinstance(data, Mapping):
             return data
         base = data.get("robot", {})
@@ -140,9 +141,9 @@ class Scenario(Frozen):
             base = _merged(RobotParameters().model_dump(), base)
         data = {**data, "robot": base}
         if isinstance(data.get("robots"), list | tuple):
-            known = base.model_dump() if isinstance(base, RobotParameters) else base
+            common = base.model_dump() if isinstance(base, RobotParameters) else base
             data["robots"] = [
-                _merged(known, one) if isinstance(one, Mapping) else one for one in data["robots"]
+                _merged(common, one) if isinstance(one, Mapping) else one for one in data["robots"]
             ]
         return data
 
@@ -151,7 +152,7 @@ class Scenario(Frozen):
     def _names_a_folder(cls, value: str) -> str:
         if not FILE_NAME.fullmatch(value):
             raise ValueError(
-                f"must be 1 to 100 letters, digits and _ . + -, a letter, digit or _ first, "
+                f"must be 1 to 100 letters, digits or _ . + -, and start with a letter, digit or _, "
                 f"got {value!r}"
             )
         return value
@@ -204,12 +205,12 @@ class Scenario(Frozen):
                     f"{self.control_period_s}"
                 )
         if len(set(self.preview_s)) < len(self.preview_s):
-            raise ValueError(f"preview_s {self.preview_s} must not hold a time twice")
+            raise ValueError(f"preview_s {self.preview_s} must not contain a time twice")
         for time_s in self.preview_s:
             if time_s > self.time_gap_s:
                 raise ValueError(
-                    f"preview_s {time_s} is beyond time_gap_s {self.time_gap_s}: what a follower "
-                    "will be told further ahead does not exist yet"
+                    f"preview_s {time_s} must be at most time_gap_s {self.time_gap_s}: later messages "
+                    "do not exist yet"
                 )
             if time_s and whole_steps(time_s, self.control_period_s) is None:
                 raise ValueError(
@@ -219,8 +220,8 @@ class Scenario(Frozen):
         room_mm = 2 * max(robot.outline_radius_mm for robot in self.robot_models)
         if self.robot_count > 1 and self.start_spacing_mm < room_mm + START_MARGIN_MM:
             raise ValueError(
-                f"start_spacing_mm {self.start_spacing_mm} must be at least the outlines' {room_mm:g} "
-                f"and {START_MARGIN_MM:g} more, or the robots touch at the start"
+                f"start_spacing_mm {self.start_spacing_mm} must be at least {room_mm:g} (the outlines) "
+                f"+ {START_MARGIN_MM:g}, or the robots touch at the start"
             )
         delay = self.disturbance.signal("actuator.computing_delay_s").reach()[1]
         if delay * self.disturbance.level > self.control_period_s:
@@ -233,28 +234,28 @@ class Scenario(Frozen):
             self.action == "torque" or isinstance(self.wheel_loop, str)
         ):
             raise ValueError(
-                "plant 'kinematic' has no torques: no action 'torque', no wheel_loop part"
+                "plant 'kinematic' has no torques: action 'torque' and wheel_loop parts are not allowed"
             )
         if self.plant == "batch":
             self.check_lanes()
         return self
 
     def check_lanes(self) -> None:
-        """Check that many formations can run at once, without Python in the step.
+        """Check that the scenario can run in a batch of formations, without Python in the step.
 
         Raises
         ------
         ValueError
-            naming the field that hinders it.
+            naming the field that prevents it.
         """
         for role, path in self.part_paths.items():
-            raise ValueError(f"{role} {path!r} is an object in Python, which no batch can run")
+            raise ValueError(f"{role} {path!r} is a Python object, which cannot run in a batch")
         if self.adversary:
-            raise ValueError("adversary True: channels cannot be set from outside in a batch")
+            raise ValueError("adversary True: a caller cannot set channels in a batch")
 
     @property
     def robot_count(self) -> int:
-        """How many robots."""
+        """Number of robots."""
         return self.robots if isinstance(self.robots, int) else len(self.robots)
 
     @property
@@ -266,7 +267,7 @@ class Scenario(Frozen):
 
     @property
     def part_paths(self) -> dict[str, str]:
-        """The onboard parts of one's own, by role."""
+        """The user-defined onboard parts, by role."""
         named = {role: getattr(self, role) for role in ("estimator", "wheel_loop", "observer")}
         return {
             role: part
@@ -276,7 +277,7 @@ class Scenario(Frozen):
 
     @property
     def privileged(self) -> bool:
-        """Whether what a policy sees comes from the truth."""
+        """Whether observations are made from the true state."""
         return self.estimator == "truth"
 
     @property
@@ -301,7 +302,7 @@ class Scenario(Frozen):
 
     @property
     def settle_s(self) -> float:
-        """Errors are counted from here on: 40 % of the horizon."""
+        """Time after which errors enter the metrics: 40 % of the horizon."""
         return SETTLE_FRACTION * self.horizon_s
 
 
@@ -316,17 +317,17 @@ def load_scenario(
     Parameters
     ----------
     source
-        ``"infinity"`` or another preset, a path to a YAML file or to a CSV file of waypoints
-        (``t_s,x_mm,y_mm``), a mapping, or a :class:`Scenario`.
+        The name of a preset (a YAML file shipped in ``configs/``) as ``"infinity"``, a path to a YAML
+        file or to a CSV file of waypoints (``t_s,x_mm,y_mm``), a mapping, or a :class:`Scenario`.
     disturbance_level
-        Overrides the level of whatever disturbance results.
+        Overrides the level of the resulting disturbance.
     **overrides
-        Fields of :class:`Scenario`; None leaves the source's value. Mappings are merged.
+        Fields of :class:`Scenario`; None keeps the source's value. Mappings are merged.
 
     Raises
     ------
     ValueError
-        in one line that names the value and what is allowed.
+        in one line with the value and what is allowed.
     """
     folder = Path()
     if isinstance(source, Scenario):
@@ -362,7 +363,7 @@ def _read_source(source: str | Path, control_period_s: float | None) -> dict[str
 
 
 def name_of(path: Path) -> str:
-    """The name of a scenario that is known by its file: what a name cannot hold becomes ``_``."""
+    """The name of a scenario from its file's name; characters that are not allowed become ``_``."""
     return NOT_IN_NAMES.sub("_", path.stem)[:100]
 
 
@@ -382,10 +383,10 @@ def _warnings_for(*what: Any) -> tuple[str, ...]:
 
 
 def scenario_warnings(scenario: Scenario) -> list[str]:
-    """What of the scenario its robots cannot do or be told, a line each.
+    """A line for each limit of the robots or of the observation that the scenario exceeds.
 
-    Constant friction and torque gains of the disturbance are in the robots' limits, at its level;
-    what varies or is drawn is not, nor are patches of the floor.
+    The robots' limits include constant friction and torque gains of the disturbance at its level. They do
+    not include signals that vary or are random, nor patches of the floor.
     """
     lines = [
         line
@@ -409,23 +410,23 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
         )
     if scenario.estimator == "ekf" and controller(scenario.residual_base).limits.cancel_slip:
         lines.append(
-            f"residual_base {scenario.residual_base!r} takes the estimated slip off its commands, and "
-            "estimator 'ekf' estimates none; it is made for 'ekf-slip'"
+            f"residual_base {scenario.residual_base!r} subtracts the estimated slip from its commands, "
+            "but estimator 'ekf' estimates none; use 'ekf-slip'"
         )
     return list(dict.fromkeys(lines))
 
 
 def scenario_notes(scenario: Scenario) -> list[str]:
-    """What is worth knowing of the scenario and no fault of it, a line each."""
+    """A line for each note on the scenario that is not a warning."""
     note = start_note(scenario.trajectory, _disturbed_robots(scenario)[0])
     return [] if note is None else [note]
 
 
 def _disturbed_robots(scenario: Scenario) -> list[RobotParameters]:
-    """Every robot with the limits that a constant disturbance leaves it."""
-    told = scenario.disturbance
+    """The robots with limits reduced by a constant disturbance."""
+    disturbance = scenario.disturbance
     grip, gain_l, gain_r = (
-        told.constant(path)
+        disturbance.constant(path)
         for path in (
             "tyre.friction_scale",
             "actuator.torque_gain_l",

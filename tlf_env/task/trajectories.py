@@ -1,7 +1,8 @@
 """Reference trajectories of the leader, with exact first and second derivatives.
 
-Heading as in the paper: θ* = atan2(−ẋ*, ẏ*), 0 facing +y, unwrapped over time. While the reference
-stands, its heading stays. The formulas and the limits of the robots are in ``docs/trajectories.md``.
+Heading as in the paper: θ* = atan2(−ẋ*, ẏ*), unwrapped over time. Heading 0 is +y (unlike ROS REP-103,
+where it is +x). While the reference is at rest, its heading is constant. Formulas and limits of the robots:
+``docs/trajectories.md``.
 """
 
 from __future__ import annotations
@@ -19,10 +20,10 @@ from tlf_env.task.waypoints import MAX_MAGNITUDE, Point, checked_points, drive_t
 
 REFERENCE_COLUMNS = ("x_mm", "y_mm", "theta_rad", "u_1_mm_s", "u_2_rad_s")
 
-STILL_MM_S = 1e-10  # below it a velocity has no direction: rounding
-NEARBY_S = 1e-5  # how long before such an instant the heading is taken
+STILL_MM_S = 1e-10  # below it the direction of a velocity is rounding
+NEARBY_S = 1e-5  # time before such an instant at which the heading is evaluated
 
-# Far beyond any robot, and small enough that no square or product overflows.
+# Far beyond any robot, and small enough that squares and products do not overflow.
 MAX_RATE_RAD_S = 1e4
 SHORTEST_RAMP_S = 1e-6
 
@@ -32,7 +33,7 @@ Rate = Annotated[Positive, Field(le=MAX_RATE_RAD_S)]
 
 
 class _Timed(Frozen):
-    """Where the reference is at every time."""
+    """A trajectory as a function of time."""
 
     @abstractmethod
     def derivatives(self, t_s: np.ndarray) -> np.ndarray:
@@ -43,8 +44,8 @@ class _Timed(Frozen):
     ) -> tuple[np.ndarray, np.ndarray]:
         """A vector along the heading and its rate of change, each ``(2, ...)``.
 
-        The velocity, given with the acceleration at ``t_s``; where that vanishes for an instant, the
-        one just before (at the start: just after).
+        These are velocity and acceleration at ``t_s``. At an instant of zero velocity the velocity just
+        before is used (at the start: just after).
         """
         still = np.hypot(*velocity) < STILL_MM_S
         if not still.any():
@@ -78,7 +79,7 @@ class _Harmonic(_Timed):
 
     @abstractmethod
     def sinusoids(self) -> tuple[list[Sinusoid], list[Sinusoid]]:
-        """The terms of x and of y about the centre."""
+        """The terms of x and y relative to the centre."""
 
     @model_validator(mode="after")
     def _bound(self) -> Self:
@@ -86,17 +87,17 @@ class _Harmonic(_Timed):
         fastest = max(abs(term.rate_rad_s) for term in terms)
         if not fastest <= MAX_RATE_RAD_S:
             raise ValueError(
-                f"{self._told_rate()} makes {fastest:g} rad/s; at most {MAX_RATE_RAD_S:g} is allowed"
+                f"{self._rate_values()} gives {fastest:g} rad/s; at most {MAX_RATE_RAD_S:g} is allowed"
             )
         return self
 
-    def _told_rate(self) -> str:
-        """The fields that the rates follow from, with their values."""
+    def _rate_values(self) -> str:
+        """The fields that determine the rates, with their values."""
         return ", ".join(f"{name} {getattr(self, name):g}" for name in self._rate_fields())
 
     @abstractmethod
     def _rate_fields(self) -> list[str]:
-        """The names of those fields."""
+        """The names of these fields."""
 
     def derivatives(self, t_s: np.ndarray) -> np.ndarray:
         """Position, velocity and acceleration: ``(3, 2, ...)`` in mm, mm/s, mm/s²."""
@@ -167,7 +168,7 @@ class Circle(_Harmonic):
     period_s: Size | None = None
     speed_mm_s: Size | None = None
     direction: Literal["counterclockwise", "clockwise"] = "counterclockwise"
-    phase_rad: Coordinate = 0.0  # φ: where it starts, from +x
+    phase_rad: Coordinate = 0.0  # φ: angle of the start, from +x
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -198,11 +199,11 @@ class Circle(_Harmonic):
 class Waypoints(_Timed):
     """A smooth curve through timed points, ``(t_s, x_mm, y_mm)`` each; the first time becomes 0.
 
-    ``file`` names a CSV file with the header ``t_s,x_mm,y_mm``. It is read at once into ``points`` and
-    then forgotten, so that a dumped model stands by itself. A relative name starts from the folder in
-    the validation context's ``folder``, or else from the working directory. The curve is the cubic
-    spline of :func:`tlf_env.task.waypoints.drive_through`: a point repeated at a later time is a stop
-    until then. After the last point the reference rests.
+    ``file`` is the path of a CSV file with the header ``t_s,x_mm,y_mm``. It is read into ``points`` during
+    validation and not kept, so that a dumped model does not depend on the file. A relative path starts at
+    ``folder`` of the validation context, or else at the working directory. The curve is the cubic spline
+    of :func:`tlf_env.task.waypoints.drive_through`: a point that is repeated at a later time is a stop
+    until then. After the last point the reference is at rest.
 
     Raises
     ------
@@ -221,11 +222,11 @@ class Waypoints(_Timed):
             return data
         file, points = data.get("file"), data.get("points")
         if (file is None) == (points is None):
-            raise ValueError("waypoints need either points or file")
+            raise ValueError("waypoints need either points or file, and not both")
         if file is None:
             return data
         if not isinstance(file, str | Path):
-            raise ValueError(f"file must be a name, got {file!r:.60}")
+            raise ValueError(f"file must be a path, got {file!r:.60}")
         folder = Path((info.context or {}).get("folder", ""))
         return {**data, "file": None, "points": read_points(folder / file)}
 
@@ -253,7 +254,7 @@ class Waypoints(_Timed):
     def tangent(
         self, t_s: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The velocity; at rest, as it was when the motion ended (before any: as it will begin)."""
+        """The velocity; at rest the last one of the motion (before any motion: the first)."""
         heading_time = drive_through(self.points).heading_time(t_s)
         direction, rate = super().tangent(heading_time, *self.derivatives(heading_time)[1:])
         return direction, np.where(heading_time == t_s, rate, 0.0)
@@ -263,11 +264,11 @@ Plain = Annotated[Lissajous | Rose | Circle | Waypoints, Field(discriminator="ty
 
 
 class StopAndGo(_Timed):
-    """Another trajectory, ``path``, driven and stood on in turns: p(t) = path(q(t)), from rest.
+    """Another trajectory, ``path``, with stops: p(t) = path(q(t)), from rest.
 
-    In every ``drive_s`` the rate q̇ rises from 0 to 1 over ``ramp_s`` by the cubic 3x² − 2x³, stays,
-    and falls again in the same way; then q stands for ``stop_s``. Hence q̈ is continuous, and a cycle
-    covers drive_s − ramp_s of the path's own time.
+    In every ``drive_s`` the rate q̇ rises from 0 to 1 over ``ramp_s`` by the cubic 3x² − 2x³, stays 1, and
+    falls to 0 in the same way; then q is constant for ``stop_s``. So q̈ is continuous, and a cycle covers
+    drive_s − ramp_s of the path's time.
 
     Raises
     ------
@@ -314,7 +315,7 @@ class StopAndGo(_Timed):
     def tangent(
         self, t_s: np.ndarray, velocity: np.ndarray, acceleration: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
-        """The path's own, at its time q: it does not depend on how fast the path is driven."""
+        """The tangent of the path at its time q; it does not depend on the rate q̇."""
         q, rate, _ = self.warp(t_s)
         direction, turning = self.path.tangent(q, *self.path.derivatives(q)[1:])
         return direction, turning * rate
@@ -329,8 +330,8 @@ def sample(trajectory: Trajectory, t_s: np.ndarray) -> np.ndarray:
     """Reference pose and twist ``(len(t_s), 5)``, columns as in :data:`REFERENCE_COLUMNS`.
 
     ``t_s`` is increasing; the heading is unwrapped along it. u₁* = √(ẋ² + ẏ²) and
-    u₂* = θ̇* = (ẋÿ − ẏẍ)/u₁*². Where the reference stands, u₁* and u₂* are 0 and θ* is the last
-    heading that it had, or before any motion the first one.
+    u₂* = θ̇* = (ẋÿ − ẏẍ)/u₁*². While the reference is at rest, u₁* and u₂* are 0 and θ* is its last
+    heading, or its first one before any motion.
     """
     t_s = np.asarray(t_s, dtype=np.float64)
     (x, y), velocity, acceleration = trajectory.derivatives(t_s)

@@ -1,7 +1,7 @@
-"""Timed waypoints: read and checked, and the smooth motion through them.
+"""Timed waypoints: reading, validation, and the smooth motion through them.
 
-A waypoint is ``(t_s, x_mm, y_mm)``. Between waypoints that differ the motion is a cubic spline;
-from a waypoint to an equal one the reference stands, and it comes to rest and leaves smoothly there.
+A waypoint is ``(t_s, x_mm, y_mm)``. Between different waypoints the motion is a cubic spline. Between equal
+waypoints the reference is at rest; it stops and starts smoothly.
 """
 
 from __future__ import annotations
@@ -22,9 +22,9 @@ HEADER = ("t_s", "x_mm", "y_mm")
 MAX_POINTS = 100_000
 MAX_MAGNITUDE = 1e9  # s, mm
 DEFAULT_ROBOTS = 3
-FEW_POINTS = 4  # with so few the free ends are natural: not-a-knot would swing wide
-REST_SHARE = 0.25  # a free end slower than this share of its chord's speed is at rest
-HELD_MM = 1.0  # so near to a rest the heading is held: its direction would be mere rounding
+FEW_POINTS = 4  # up to this number free ends are natural: not-a-knot would overshoot
+REST_SHARE = 0.25  # a free end is at rest if slower than this share of its chord's speed
+HELD_MM = 1.0  # within this distance of a rest the heading is constant: its direction is rounding
 SEARCH_PARTS = 64  # of an interval, in the search for that distance
 
 Point = tuple[float, float, float]
@@ -36,7 +36,7 @@ def read_points(path: Path) -> tuple[Point, ...]:
     Raises
     ------
     ValueError
-        in one line that names the file, the line, the value and what is allowed.
+        in one line with the file, the line, the value and what is allowed.
     """
     try:
         text = path.read_text(encoding="utf-8-sig")
@@ -63,15 +63,15 @@ def read_points(path: Path) -> tuple[Point, ...]:
 def checked_points(
     rows: Sequence[Any], whole: str, place: Callable[[int], str]
 ) -> tuple[Point, ...]:
-    """Rows of three numbers as waypoints, the first time subtracted.
+    """Rows of three numbers as waypoints, minus the first time.
 
-    ``whole`` names all of them and ``place(i)`` row i, for errors.
+    ``whole`` names the source and ``place(i)`` row i in errors.
 
     Raises
     ------
     ValueError
         for a row that is not three finite numbers, fewer than two or too many rows, a time that does
-        not increase, no motion at all, or a distance that no robot covers in its time.
+        not increase, no motion, or a distance that no robot can cover in the given time.
     """
     if not 2 <= len(rows) <= MAX_POINTS:
         raise ValueError(f"{whole} must have 2 to {MAX_POINTS} waypoints, got {len(rows)}")
@@ -82,24 +82,25 @@ def checked_points(
         if duration_s <= 0:
             raise ValueError(
                 f"{place(i)}: t_s {raw[i][0]:.17g} must be above {raw[i - 1][0]:.17g}, "
-                "the time before it"
+                "the previous time"
             )
         distance_mm = math.dist(points[i][1:], points[i - 1][1:])
         if distance_mm > FULL_SPEED_MM_S * duration_s:
             raise ValueError(
-                f"{place(i)}: {distance_mm:.6g} mm from the waypoint before, in {duration_s:.6g} s, "
-                f"is {distance_mm / duration_s:.6g} mm/s; a robot can be asked for "
-                f"{FULL_SPEED_MM_S:g} at most"
+                f"{place(i)}: {distance_mm:.6g} mm from the previous waypoint in {duration_s:.6g} s "
+                f"is {distance_mm / duration_s:.6g} mm/s; at most {FULL_SPEED_MM_S:g} is allowed"
             )
     if all(point[1:] == points[0][1:] for point in points):
-        raise ValueError(f"{whole}: all waypoints are at one place; at least two must differ")
+        raise ValueError(
+            f"{whole}: all waypoints are at the same position; at least two must differ"
+        )
     return tuple(points)
 
 
 def _numbers(row: Any, place: str) -> Point:
     if not isinstance(row, list | tuple) or len(row) != len(HEADER):
         got = f"{len(row)}" if isinstance(row, list | tuple) else repr(row)[:60]
-        raise ValueError(f"{place}: needs {len(HEADER)} numbers, {','.join(HEADER)}, got {got}")
+        raise ValueError(f"{place}: must be {len(HEADER)} numbers, {','.join(HEADER)}, got {got}")
     values = []
     for name, cell in zip(HEADER, row, strict=True):
         try:
@@ -115,7 +116,7 @@ def _numbers(row: Any, place: str) -> Point:
 
 
 class Drive(NamedTuple):
-    """The motion through waypoints: a piecewise cubic, and the stretches in which it moves."""
+    """The motion through waypoints: a piecewise cubic, and the intervals (stretches) of motion."""
 
     position: Any  # scipy PPoly of (x, y), mm, from 0 to the last time
     velocity: Any
@@ -123,7 +124,7 @@ class Drive(NamedTuple):
     end_s: float
     from_s: np.ndarray  # (stretch,)
     to_s: np.ndarray
-    first_s: np.ndarray  # up to here, and from last_s on, the heading is held
+    first_s: np.ndarray  # before it, and after last_s, the heading is constant
     last_s: np.ndarray
 
     def derivatives(self, t_s: np.ndarray) -> np.ndarray:
@@ -134,7 +135,7 @@ class Drive(NamedTuple):
         return np.moveaxis(out, -1, 1)
 
     def heading_time(self, t_s: np.ndarray) -> np.ndarray:
-        """When the heading at ``t_s`` was last told: ``t_s`` itself while it moves."""
+        """The time whose heading applies at ``t_s``: ``t_s`` itself during motion."""
         stretch = np.maximum(np.searchsorted(self.from_s, t_s, side="left") - 1, 0)
         return np.clip(t_s, self.first_s[stretch], self.last_s[stretch])
 
@@ -143,9 +144,9 @@ class Drive(NamedTuple):
 def drive_through(points: tuple[Point, ...]) -> Drive:
     """The motion through checked waypoints: a cubic spline for every stretch between two rests.
 
-    A stretch starts and ends with zero speed where it touches a rest. The ends of the whole are free
-    (not-a-knot; natural with at most four points), unless the speed there is so low or so much
-    against the chord that the motion must have begun or ended at rest.
+    A stretch starts and ends with zero speed at a rest. The first and last end are free (not-a-knot;
+    natural with at most four points). If the resulting speed there is low, or directed against the chord,
+    the motion starts or ends at rest instead.
 
     Raises
     ------
@@ -197,13 +198,13 @@ def _ends(rests: np.ndarray, intervals: int) -> tuple[str, str]:
 
 
 def _slow_ends(t: np.ndarray, xy: np.ndarray, velocity: np.ndarray) -> np.ndarray:
-    """Which of the two ends are at rest by their velocity (end, 2): else a heading would flip there."""
+    """Which of the two ends are at rest by their velocity (end, 2); otherwise the heading would flip there."""
     chord = np.stack([(xy[1] - xy[0]) / (t[1] - t[0]), (xy[-1] - xy[-2]) / (t[-1] - t[-2])])
     return (velocity * chord).sum(axis=1) < REST_SHARE * (chord**2).sum(axis=1)
 
 
 def _leaves(position: Any, t: np.ndarray) -> float:
-    """When a motion is first ``HELD_MM`` from where it is at ``t[0]``; its middle if it never is."""
+    """The first time with a distance of ``HELD_MM`` to the position at ``t[0]``; else the middle time."""
     start = position(t[0])
     for a, b in itertools.pairwise(t):
         part = np.linspace(a, b, SEARCH_PARTS + 1)[1:]
@@ -214,14 +215,14 @@ def _leaves(position: Any, t: np.ndarray) -> float:
 
 
 def scenario_of_waypoints(path: Path, control_period_s: float = 0.02) -> dict[str, Any]:
-    """A scenario of three robots along a CSV file's waypoints, to the last one's time.
+    """A scenario of three robots on the waypoints of a CSV file, until the last waypoint.
 
-    ``horizon_s`` is rounded up to the control period.
+    ``horizon_s`` is rounded up to a multiple of the control period.
 
     Raises
     ------
     ValueError
-        in one line, as :func:`read_points`.
+        as :func:`read_points`.
     """
     points = read_points(path)
     steps = max(math.ceil(points[-1][0] / control_period_s - 1e-9), 1)
