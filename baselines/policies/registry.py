@@ -71,7 +71,7 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     """
     policy = _made(name, scenario, trust=trust)
     if isinstance(policy, LearnedPolicy):
-        policy.check_fit(name, scenario)
+        policy.bind(name, scenario)
     return policy
 
 
@@ -108,7 +108,7 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
         asked = {field: _plain(value) for field, value in differing.items()}
         scenario = fitted if asked else scenario
     if isinstance(policy, LearnedPolicy):
-        policy.check_fit(name, scenario)
+        policy.bind(name, scenario)
     return FittedPolicy(policy, scenario, asked)
 
 
@@ -134,7 +134,10 @@ def describe_overrides(overrides: Mapping[str, Any]) -> list[str]:
 
 def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
     """Fields that a policy asks for and that are not set yet."""
-    asked = getattr(policy, "scenario_overrides", {})
+    if isinstance(policy, LearnedPolicy):
+        asked: Any = policy.overrides_for(scenario)
+    else:
+        asked = getattr(policy, "scenario_overrides", {})
     if not isinstance(asked, Mapping) or set(asked) - set(OVERRIDABLE):
         raise ValueError(
             f"policy {name!r}: scenario_overrides must map fields of {', '.join(OVERRIDABLE)}; "

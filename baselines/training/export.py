@@ -9,8 +9,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from baselines.policies.card import WEIGHTS, Card, Network, write_policy
+from baselines.policies.card import WEIGHTS, Card, write_policy
 from baselines.policies.learned import load_policy
+from baselines.policies.network import Network
 from baselines.runs.provenance import installed_versions, versions
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.actions import ACTION_SIZE
