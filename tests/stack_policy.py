@@ -39,8 +39,9 @@ from tlf_env.onboard.wheel_loop import (
     wheel_torque,
     write_loop_state,
 )
+from tlf_env.physics.state import read_body
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
-from tlf_env.physics.vehicle import body_array, odometry, read_body, wheel_speeds
+from tlf_env.physics.vehicle import body_array, odometry, wheel_speeds
 from tlf_env.task.actions import (
     ACTION_SIZE,
     FULL_SPEED_MM_S,

@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 
 pytest.importorskip("arch")
 
-from baselines.benchmark import aggregate
-from baselines.benchmark.bench import Plan
+from baselines.benchmark import aggregate, comparisons, page, statistics
+from baselines.benchmark import lines as of_lines
+from baselines.benchmark.plan import Plan
 
 ROBOT = {
     "lost": False,
@@ -51,8 +52,8 @@ def results(lines, folder: Path, **plan):
 
 
 def test_the_interquartile_mean_drops_a_quarter_at_either_end():
-    assert aggregate.interquartile_mean(np.array([-1000, 2, 4, 1e9])) == 3
-    assert aggregate.interquartile_mean(np.array([7.0])) == 7
+    assert statistics.interquartile_mean(np.array([-1000, 2, 4, 1e9])) == 3
+    assert statistics.interquartile_mean(np.array([7.0])) == 7
 
 
 def test_a_share_has_wilsons_interval():
@@ -60,42 +61,42 @@ def test_a_share_has_wilsons_interval():
     share = events / runs
     middle = (share + z**2 / (2 * runs)) / (1 + z**2 / runs)
     half = z / (1 + z**2 / runs) * math.sqrt(share * (1 - share) / runs + (z / runs) ** 2 / 4)
-    found = aggregate.rate(events, runs)
+    found = statistics.rate(events, runs)
     assert found["share"] == share
     assert found["interval"] == pytest.approx([middle - half, middle + half])
-    assert aggregate.rate(0, 50)["interval"][0] == 0
+    assert statistics.rate(0, 50)["interval"][0] == 0
 
 
 def test_the_intervals_of_a_mean_agree_with_all_resamples():
     values = np.array([1.0, 4.0, 9.0, 10.0])
     means = [np.mean(pick) for pick in itertools.product(values, repeat=4)]
-    found = aggregate.interval(values, lambda x: float(np.mean(x)))
+    found = statistics.interval(values, lambda x: float(np.mean(x)))
     assert found == pytest.approx(np.percentile(means, [2.5, 97.5]), abs=0.5)
 
 
 def test_a_stratified_interval_resamples_each_stratum_by_itself():
     strata = [np.zeros(5), np.full(5, 100.0)]
     mean = lambda *parts: float(np.mean(np.concatenate(parts)))  # noqa: E731  a statistic for one use
-    assert aggregate.stratified_interval(strata, mean) == [50, 50]
-    low, high = aggregate.interval(np.concatenate(strata), lambda x: float(np.mean(x)))
+    assert statistics.stratified_interval(strata, mean) == [50, 50]
+    low, high = statistics.interval(np.concatenate(strata), lambda x: float(np.mean(x)))
     assert high - low > 30
 
 
 def test_intervals_are_the_same_every_time_and_none_of_one_value():
     values = np.arange(9.0)
-    twice = [aggregate.interval(values, aggregate.interquartile_mean) for _ in range(2)]
+    twice = [statistics.interval(values, statistics.interquartile_mean) for _ in range(2)]
     assert twice[0] == twice[1]
-    assert aggregate.interval(values[:1], np.median) is None
-    assert aggregate.stratified_interval([values, values[:1]], np.median) is None
-    assert aggregate.stratified_interval([], np.median) is None
+    assert statistics.interval(values[:1], np.median) is None
+    assert statistics.stratified_interval([values, values[:1]], np.median) is None
+    assert statistics.stratified_interval([], np.median) is None
 
 
 @given(SCORES, SCORES)
 def test_the_probability_of_improvement_counts_pairs(mine, theirs):
     pairs = [(a > b) + 0.5 * (a == b) for a in mine for b in theirs]
-    found = aggregate.improvement(mine, theirs)
+    found = statistics.improvement(mine, theirs)
     assert found == pytest.approx(np.mean(pairs))
-    assert found + aggregate.improvement(theirs, mine) == pytest.approx(1)
+    assert found + statistics.improvement(theirs, mine) == pytest.approx(1)
 
 
 def test_a_profile_weighs_every_stratum_the_same():
@@ -122,7 +123,7 @@ def test_a_profile_weighs_every_stratum_the_same():
     ],
 )
 def test_a_crossing_lies_between_its_neighbours(shares, level, at):
-    assert aggregate.crossing([0, 10, 20, 30], shares, level) == (at and pytest.approx(at))
+    assert statistics.crossing([0, 10, 20, 30], shares, level) == (at and pytest.approx(at))
 
 
 def test_a_sweep_is_walked_from_the_nominal_value_outwards(tmp_path):
@@ -149,9 +150,9 @@ def test_a_run_fails_once_however_many_robots_fail(tmp_path):
 def test_a_run_counts_at_its_worst_robot_and_scores_the_mean():
     run = line(score=10.0)
     run["robots"].append(ROBOT | {"score": 30.0, "position_rmse_mm": 8.0})
-    assert aggregate.worst(run, "position_rmse_mm") == 8
-    assert aggregate.worst(run, "settled_formation_rmse_mm") is None
-    assert aggregate.run_score(run) == 20
+    assert of_lines.worst(run, "position_rmse_mm") == 8
+    assert of_lines.worst(run, "settled_formation_rmse_mm") is None
+    assert of_lines.run_score(run) == 20
 
 
 def test_scores_are_normalised_by_the_reference_whatever_the_order(tmp_path):
@@ -194,12 +195,12 @@ def test_a_paired_interval_is_narrow_where_seeds_explain_the_spread():
     rng = np.random.default_rng(1)
     seeds = rng.normal(50, 20, 60)
     theirs, mine = seeds, seeds - 2 + rng.normal(0, 0.1, 60)
-    row = aggregate.comparison(runs("mine", mine), runs("theirs", theirs))
+    row = comparisons.comparison(runs("mine", mine), runs("theirs", theirs))
     found = row["position_rmse_mm"]
     assert found["difference"] == pytest.approx(np.median(mine) - np.median(theirs))
     assert found["interval"][0] < -2 < found["interval"][1] < 0
     assert found["interval"][1] - found["interval"][0] < 1
-    shuffled = aggregate.comparison(runs("mine", rng.permutation(mine)), runs("theirs", theirs))
+    shuffled = comparisons.comparison(runs("mine", rng.permutation(mine)), runs("theirs", theirs))
     low, high = shuffled["position_rmse_mm"]["interval"]
     assert low < 0 < high
     assert high - low > 5
@@ -210,7 +211,7 @@ def test_a_paired_interval_is_narrow_where_seeds_explain_the_spread():
 def test_a_difference_has_the_sign_of_the_shift_and_turns_with_the_policies(shift, n):
     theirs = np.linspace(10, 20, n)
     better, worse = (
-        aggregate.comparison(*pair)["position_rmse_mm"]
+        comparisons.comparison(*pair)["position_rmse_mm"]
         for pair in (
             (runs("a", theirs - shift), runs("b", theirs)),
             (runs("b", theirs), runs("a", theirs - shift)),
@@ -219,31 +220,31 @@ def test_a_difference_has_the_sign_of_the_shift_and_turns_with_the_policies(shif
     assert better["difference"] == pytest.approx(-shift)
     assert better["interval"] == pytest.approx([-shift, -shift])
     assert worse["interval"] == pytest.approx([shift, shift])
-    assert (aggregate.sign(better, 0), aggregate.sign(worse, 0)) == (-1, 1)
+    assert (page.sign(better, 0), page.sign(worse, 0)) == (-1, 1)
 
 
 def test_torque_is_compared_by_its_ratio():
     pair = [runs(name, range(4), torque_rms_Nmm=t) for name, t in (("a", 6.0), ("b", 5.0))]
-    found = aggregate.comparison(*pair)["torque_rms_Nmm"]
+    found = comparisons.comparison(*pair)["torque_rms_Nmm"]
     assert found == {"ratio": pytest.approx(1.2), "interval": pytest.approx([1.2, 1.2])}
-    assert aggregate.compared(found, 2) == "**1.20** [1.20, 1.20]"
-    assert aggregate.paired([(0.0, 0.0)] * 3, "ratio") == {"ratio": None, "interval": None}
+    assert page.compared(found, 2) == "**1.20** [1.20, 1.20]"
+    assert statistics.paired([(0.0, 0.0)] * 3, "ratio") == {"ratio": None, "interval": None}
 
 
 def test_pairs_that_are_undefined_on_one_side_are_left_out():
-    found = aggregate.paired([(None, 1.0), (1.0, None), (3.0, 1.0), (3.0, 1.0)], "difference")
+    found = statistics.paired([(None, 1.0), (1.0, None), (3.0, 1.0), (3.0, 1.0)], "difference")
     assert found == {"difference": 2, "interval": [2, 2]}
-    assert aggregate.paired([(None, 1.0)], "ratio") == {"ratio": None, "interval": None}
-    assert aggregate.compared({"ratio": None, "interval": None}, 2) == "–"
+    assert statistics.paired([(None, 1.0)], "ratio") == {"ratio": None, "interval": None}
+    assert page.compared({"ratio": None, "interval": None}, 2) == "–"
 
 
-def test_what_cannot_be_told_apart_is_not_bold():
-    assert aggregate.compared({"difference": 0.5, "interval": [-0.1, 1.0]}, 1) == "+0.5 [-0.1, 1.0]"
-    assert aggregate.sign({"difference": 1.0, "interval": None}, 0.0) == 0
+def test_a_difference_that_is_not_significant_is_not_bold():
+    assert page.compared({"difference": 0.5, "interval": [-0.1, 1.0]}, 1) == "+0.5 [-0.1, 1.0]"
+    assert page.sign({"difference": 1.0, "interval": None}, 0.0) == 0
 
 
 def test_an_entry_meets_the_rival_that_fails_least_and_then_errs_least(tmp_path, monkeypatch):
-    monkeypatch.setattr(aggregate, "REPEATS", 100)
+    monkeypatch.setattr(statistics, "REPEATS", 100)
     lines = [
         *runs("learned", (5.0, 6.0)),
         *runs("pure_pursuit", (1.0, 2.0), touched=True),
@@ -256,12 +257,12 @@ def test_an_entry_meets_the_rival_that_fails_least_and_then_errs_least(tmp_path,
     assert set(rows) == {"learned", "oracle"}
     assert rows["learned"]["rival"] == rows["oracle"]["rival"] == "reference:tuned"
     assert rows["learned"]["failed"] == [0, 0]
-    table = "\n".join(aggregate.comparison_tables(board))
-    assert "smaller in 1 of 1 rows, larger in 0, not told apart in 0" in table
+    table = "\n".join(page.comparison_tables(board))
+    assert "smaller in 1 of 1 rows, larger in 0, no significant difference in 0" in table
 
 
 def test_without_an_entry_the_first_by_score_meets_the_others(tmp_path, monkeypatch):
-    monkeypatch.setattr(aggregate, "REPEATS", 100)
+    monkeypatch.setattr(statistics, "REPEATS", 100)
     lines = [
         line(policy, seed, score=score)
         for seed in range(2)
@@ -294,7 +295,7 @@ def test_the_page_shows_the_figures_that_were_drawn(tmp_path):
 
 
 def test_what_is_undefined_is_a_dash():
-    assert aggregate.number(None, 1) == aggregate.number(math.nan, 1) == "–"
-    assert aggregate.number(1.26, 1) == "1.3"
-    assert aggregate.span([1.26, 2], 1) == "[1.3, 2.0]"
-    assert aggregate.span(None, 1) == ""
+    assert page.number(None, 1) == page.number(math.nan, 1) == "–"
+    assert page.number(1.26, 1) == "1.3"
+    assert page.span([1.26, 2], 1) == "[1.3, 2.0]"
+    assert page.span(None, 1) == ""

@@ -394,7 +394,9 @@ def test_a_policy_with_a_memory_runs_side_by_side():
 
 def test_the_benchs_lines_are_those_of_pymunk_up_to_contacts(tmp_path):
     pytest.importorskip("arch")
-    from baselines.benchmark.bench import RUNS, Plan, run_bench
+    from baselines.benchmark.bench import run_bench
+    from baselines.benchmark.plan import Plan
+    from baselines.benchmark.results import RUNS_FILE
 
     def plan(plant: str) -> Plan:
         return Plan(
@@ -419,7 +421,7 @@ def test_the_benchs_lines_are_those_of_pymunk_up_to_contacts(tmp_path):
         assert len(hashes) == 2
         assert one == other
     # what is missing after an interruption is run in other blocks, and the lines are the same
-    runs = tmp_path / "batch" / RUNS
+    runs = tmp_path / "batch" / RUNS_FILE
     lines = runs.read_text().splitlines(keepends=True)
     runs.write_text("".join(lines[::3]))
     run_bench(plan("batch"), tmp_path / "batch", processes=2)

@@ -16,8 +16,11 @@ pytest.importorskip("arch")
 
 from baselines.benchmark import bench
 from baselines.benchmark.aggregate import leaderboard, write_leaderboard
-from baselines.benchmark.bench import Cell, Plan, parse_seeds, parse_sweep, run_bench, with_value
+from baselines.benchmark.bench import run_bench
+from baselines.benchmark.plan import Episode, Plan, parse_seeds, parse_sweep
+from baselines.benchmark.results import RUNS_FILE
 from baselines.cli import main
+from baselines.runs.nested import value_at, with_value
 from baselines.runs.run import run_policy
 from tlf_env.task.observation import sensor_entries
 from tlf_env.task.scenario import load_scenario
@@ -30,7 +33,7 @@ PLAN = Plan(
     seeds=(20_000, 20_003),
     overrides=SHORT,
 )
-COMMAND = [sys.executable, "-c", "from baselines.cli import main; main()", "bench"]
+COMMAND = [sys.executable, "-m", "baselines", "bench"]
 ARGUMENTS = [
     *("--policies", "reference:consistent,pure_pursuit"),
     *("--tasks", "infinity"),
@@ -43,7 +46,7 @@ RUNS_IN_ALL = 2 * 2 * 30
 
 
 def lines_in(folder: Path) -> int:
-    path = folder / bench.RUNS
+    path = folder / RUNS_FILE
     return path.read_bytes().count(b"\n") if path.exists() else 0
 
 
@@ -112,37 +115,37 @@ def written(path):
 
 
 def test_what_is_finished_is_not_run_again(tmp_path, monkeypatch):
-    real, run = bench.run_cell, []
+    real, run = bench.run_episode, []
 
-    def breaks_at_the_fifth(plan, cell):
-        run.append(cell)
+    def breaks_at_the_fifth(plan, episode):
+        run.append(episode)
         if len(run) == 5:
             raise RuntimeError
-        return real(plan, cell)
+        return real(plan, episode)
 
-    monkeypatch.setattr(bench, "run_cell", breaks_at_the_fifth)
+    monkeypatch.setattr(bench, "run_episode", breaks_at_the_fifth)
     with pytest.raises(RuntimeError):
         run_bench(PLAN, tmp_path)
     assert lines_in(tmp_path) == 4
     results = run_bench(PLAN, tmp_path)
-    assert run == [*PLAN.cells()[:5], *PLAN.cells()[4:]]
+    assert run == [*PLAN.episodes()[:5], *PLAN.episodes()[4:]]
     assert not results.missing()
-    before = written(tmp_path / bench.RUNS)
+    before = written(tmp_path / RUNS_FILE)
     assert run_bench(PLAN, tmp_path).ordered() == results.ordered()
-    assert written(tmp_path / bench.RUNS) == before
+    assert written(tmp_path / RUNS_FILE) == before
 
 
 def test_a_torn_last_line_is_cut_and_run_again(tmp_path):
     whole = run_bench(PLAN, tmp_path).ordered()
-    path = tmp_path / bench.RUNS
+    path = tmp_path / RUNS_FILE
     path.write_bytes(path.read_bytes()[:-30])
     assert run_bench(PLAN, tmp_path).ordered() == whole
-    assert lines_in(tmp_path) == len(PLAN.cells())
+    assert lines_in(tmp_path) == len(PLAN.episodes())
 
 
 def test_a_damaged_line_is_told(tmp_path):
     run_bench(PLAN, tmp_path)
-    path = tmp_path / bench.RUNS
+    path = tmp_path / RUNS_FILE
     path.write_bytes(b"{}\n" + path.read_bytes())
     with pytest.raises(ValueError, match=r"runs\.jsonl, line 1 is damaged"):
         run_bench(PLAN, tmp_path)
@@ -242,13 +245,13 @@ def test_a_sweep_runs_every_value():
     path, values = parse_sweep("slip.delta_1_mm_s=0:40:5")
     assert (path, values) == ("slip.delta_1_mm_s", (0, 10, 20, 30, 40))
     plan = Plan(**(vars(PLAN) | {"sweep": path, "sweep_values": values, "seeds": (0, 1)}))
-    assert [cell.sweep for cell in plan.cells()[:10:2]] == list(values)
+    assert [episode.sweep for episode in plan.episodes()[:10:2]] == list(values)
     for value in values:
-        scenario = plan.scenario(Cell("", "infinity", "start", 1.0, value, 0))
+        scenario = plan.scenario(Episode("", "infinity", "start", 1.0, value, 0))
         assert scenario.disturbance.slip.delta_1_mm_s.value == value
         assert scenario.disturbance.start.position_std_mm.value > 0
     level = Plan(**(vars(plan) | {"sweep": "level"}))
-    assert level.scenario(Cell("", "infinity", "ice", 1.0, 0.5, 0)).disturbance.level == 0.5
+    assert level.scenario(Episode("", "infinity", "ice", 1.0, 0.5, 0)).disturbance.level == 0.5
 
 
 def test_a_swept_bench_tells_where_policies_break(tmp_path):
@@ -265,9 +268,13 @@ def test_a_swept_bench_tells_where_policies_break(tmp_path):
 def test_only_numbers_that_exist_can_be_swept():
     tree = {"a": {"b": 1}, "c": 2}
     assert with_value(tree, "a.b", 5) == {"a": {"b": 5}, "c": 2}
-    assert tree["a"]["b"] == 1
-    for path in ("x", "a.x", "c.d"):
-        with pytest.raises(ValueError, match="sweep:"):
+    assert value_at(tree, "a.b") == tree["a"]["b"] == 1
+    for path, said in (
+        ("x", "no 'x'; there are a, c"),
+        ("a.x", "no 'x'"),
+        ("c.d", "'c' has no parts"),
+    ):
+        with pytest.raises(ValueError, match=said):
             with_value(tree, path, 5)
 
 
@@ -296,7 +303,7 @@ def test_seeds_of_another_form_are_told(text):
         ("--tasks sensor.yaml", "takes 'tracking' observations"),
         ("--disturbances no_such", "no_such"),
         ("--disturbances nominal,no_such", "no_such"),
-        ("--sweep slip.no_such=0:1:2", "no_such"),
+        ("--sweep slip.no_such=0:1:2", "sweep: there is no 'no_such'"),
         ("--sweep no_such=0:1:2", "no_such"),
         ("--sweep tyre.friction_scale=1:-1:3", "friction_scale"),
         ("--disturbances nominal,ice --sweep level=0:3:4", "friction_scale"),
@@ -335,7 +342,7 @@ def test_bad_input_is_one_line_and_writes_nothing(words, said, tmp_path, monkeyp
     assert not list((tmp_path / "out").glob("*"))
 
 
-def test_an_option_stands_above_the_plan(tmp_path, monkeypatch):
+def test_an_option_takes_precedence_over_the_plan(tmp_path, monkeypatch):
     (tmp_path / "plan.yaml").write_text(
         "policies: [pure_pursuit, feedback_linearisation]\ntasks: infinity\n"
         'disturbances: nominal\nseeds: "3:4"\nhorizon_s: 2\n'
@@ -370,7 +377,8 @@ def test_an_error_in_a_worker_is_not_swallowed(tmp_path, monkeypatch):
 
 def test_the_figures_are_drawn_from_what_the_table_holds(tmp_path):
     pytest.importorskip("matplotlib")
-    from baselines.benchmark.figures import knob_label, write_bench_figures
+    from baselines.benchmark.figures import write_bench_figures
+    from baselines.benchmark.sweep_figure import knob_label
 
     board = write_leaderboard(run_bench(PLAN, tmp_path), tmp_path, "tlf bench")
     written = write_bench_figures(board, tmp_path)

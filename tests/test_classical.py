@@ -5,12 +5,12 @@ import math
 import numpy as np
 import pytest
 
-from baselines.policies.classical import DEFAULT_PREVIEW_S, FeedbackLinearisation, PurePursuit
+from baselines.policies.classical import FeedbackLinearisation, PurePursuit
 from baselines.policies.registry import make_policy
 from baselines.runs.run import run_policy
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
-from tlf_env.task.scenario import load_scenario
+from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
 
 ENTRIES = tracking_entries(DEFAULT_PREVIEW_S)
 RIVALS = [PurePursuit, FeedbackLinearisation]

@@ -10,7 +10,7 @@ import pytest
 from helpers import TAIL_FROM, Run, drive
 
 from baselines import ReferencePolicy
-from baselines.policies.registry import enter
+from baselines.policies.registry import fit_policy
 from baselines.runs.run import run_policy
 from tlf_env.onboard.tracking import TrackingGains
 from tlf_env.physics.parameters import RobotParameters
@@ -249,7 +249,7 @@ TUNED_RMS_MM = {
 
 def disturbed(policy: str, disturbance: str, seed: int) -> tuple[float, bool, bool]:
     """Error in the tail (mm) of the worst robot; whether any was lost, and whether any touched."""
-    entry = enter(policy, load_scenario("infinity", horizon_s=60.0, disturbance=disturbance))
+    entry = fit_policy(policy, load_scenario("infinity", horizon_s=60.0, disturbance=disturbance))
     record = run_policy(entry.scenario, entry.policy, seed)
     tail = record["position_error_mm"][int(TAIL_FROM * len(record.t_s)) :]
     robots = record.metrics()
@@ -277,7 +277,7 @@ def test_the_tuned_reference_loses_nobody(disturbance, seed):
 )
 def test_the_tuned_reference_is_precise_where_nothing_disturbs(task, own_mm, formation_mm, seed):
     """Worst robot from 40 % of the horizon on."""
-    entry = enter("reference:tuned", load_scenario(task))
+    entry = fit_policy("reference:tuned", load_scenario(task))
     robots = run_policy(entry.scenario, entry.policy, seed).metrics()
     assert max(robot.position_rmse_mm for robot in robots) <= own_mm
     assert max(robot.settled_formation_rmse_mm for robot in robots) <= formation_mm

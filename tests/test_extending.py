@@ -113,7 +113,7 @@ NEW = """
 import numpy as np
 import tlf_env
 from baselines import ReferencePolicy
-from baselines.runs.recording import run_policy
+from baselines.runs.run import run_policy
 from tlf_env.disturbances.channels import number
 from tlf_env.disturbances.table import table
 from tlf_env.task.observation import tracking_entries

@@ -13,11 +13,14 @@ import pytest
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from baselines import ReferencePolicy
 from baselines.runs import figures
+from baselines.runs.panels import MOST_POINTS, MOST_SHOWN, robot_colour, thinned, title
+from baselines.runs.plane import body_polygons, snapshot_rows
 from baselines.runs.run import Record, run_policy
 from tlf_env import load_scenario
 
@@ -224,7 +227,7 @@ def test_texts_stay_clear_of_the_axes_and_of_each_other(kind: str, name: str) ->
 def test_robots_are_drawn_at_the_snapshots_and_each_time_is_named_once(kind: str) -> None:
     run = record(kind)
     plane = figures.overview(run).axes[0]
-    rows = figures.snapshot_rows(run)
+    rows = snapshot_rows(run)
     assert rows[0] == len(run.t_s) - 1
     assert [text.get_text() for text in plane.texts] == [f"{run.t_s[k]:g} s" for k in rows]
     outlines = [patch for patch in plane.patches if isinstance(patch, Circle)]
@@ -255,7 +258,7 @@ def test_every_robot_is_drawn_with_its_own_measures() -> None:
     ]
     assert plane.get_xlim()[1] > run["x_mm"].max() + 150.0
     for i, model in enumerate(models):
-        left, right, castor, _ = figures.body_polygons(run, 0, i)
+        left, right, castor, _ = body_polygons(run, 0, i)
         axle_mm = np.linalg.norm(left.mean(axis=0) - right.mean(axis=0))
         assert axle_mm == pytest.approx(model.axle_width_mm)
         assert np.linalg.norm(left[2] - left[1]) == pytest.approx(2 * model.wheel_radius_mm)
@@ -277,7 +280,7 @@ def test_the_legend_names_a_torque_limit_that_all_motors_share_and_no_other() ->
 
 def test_snapshots_keep_their_distance() -> None:
     run = record("1")
-    rows = figures.snapshot_rows(run)
+    rows = snapshot_rows(run)
     assert len(rows) > 1
     places = np.stack([run["x_mm"][rows, 0], run["y_mm"][rows, 0]], axis=-1)
     apart = np.linalg.norm(places[:, None] - places, axis=-1)
@@ -298,7 +301,7 @@ def test_bodies_are_to_scale_and_face_where_they_head(
     run = record("1")
     at = {"x_mm": 1000.0, "y_mm": -500.0, "theta_rad": theta, "castor_rad": castor}
     columns = {**run.columns, **{name: np.full((1, 1), value) for name, value in at.items()}}
-    polygons = figures.body_polygons(replace(run, columns=columns), 0, 0)
+    polygons = body_polygons(replace(run, columns=columns), 0, 0)
     polygons = [polygon - (1000.0, -500.0) for polygon in polygons]
     for polygon, centre in zip(polygons, (left, right, wheel), strict=False):
         np.testing.assert_allclose(polygon.mean(axis=0), centre, atol=1e-9)
@@ -329,17 +332,17 @@ def test_the_settle_time_is_marked() -> None:
 
 def test_the_title_names_task_policy_disturbance_and_seed() -> None:
     run = record("1")
-    assert figures.title(run) == "flower, policy test, disturbance nominal, seed 0"
+    assert title(run) == "flower, policy test, disturbance nominal, seed 0"
     half = load_scenario(run.scenario, disturbance_level=0.5)
-    assert "nominal × 0.5" in figures.title(replace(run, scenario=half))
+    assert "nominal × 0.5" in title(replace(run, scenario=half))
 
 
 @pytest.mark.parametrize("count", [1, 10, 4000, 4001, 99_999])
 def test_thinning_keeps_the_ends_and_the_extremes(count: int) -> None:
     t_s = np.arange(count) * 0.001
     values = np.random.default_rng(count).normal(size=count)
-    kept_s, kept = figures.thinned(t_s, values)
-    assert len(kept) <= figures.MOST_POINTS + 2
+    kept_s, kept = thinned(t_s, values)
+    assert len(kept) <= MOST_POINTS + 2
     assert (kept_s[0], kept_s[-1]) == (t_s[0], t_s[-1])
     assert (kept.min(), kept.max()) == (values.min(), values.max())
     np.testing.assert_array_equal(values[np.searchsorted(t_s, kept_s)], kept)
@@ -348,7 +351,7 @@ def test_thinning_keeps_the_ends_and_the_extremes(count: int) -> None:
 @pytest.mark.parametrize("n", range(1, 21))
 def test_colours_and_markers_tell_robots_apart(n: int) -> None:
     run = replace(record("1"), lost_at_s=np.full(n, np.inf))
-    colours = {tuple(figures.to_rgb(figures._colour(run, i))) for i in range(n)}
+    colours = {tuple(to_rgb(robot_colour(run, i))) for i in range(n)}
     assert len(colours) == n
     assert all(np.dot(c, (0.2126, 0.7152, 0.0722)) < 0.85 for c in colours)  # none lost on white
 
@@ -365,7 +368,7 @@ def test_very_many_robots_get_a_spread_of_rows() -> None:
         touched_at_s=np.tile(run.touched_at_s, 40),
     )
     rows = figures.slip(crowd).axes
-    assert len(rows) == figures.MOST_SHOWN
+    assert len(rows) == MOST_SHOWN
     assert rows[0].get_ylabel().startswith("robot 0\n")
     assert rows[-1].get_ylabel().startswith("robot 399\n")
 

@@ -10,8 +10,9 @@ import pytest
 pytest.importorskip("arch")
 pytest.importorskip("matplotlib")
 
-from baselines.benchmark.aggregate import markdown
-from baselines.benchmark.bench import Cell, run_cell
+from baselines.benchmark.bench import run_episode
+from baselines.benchmark.page import markdown
+from baselines.benchmark.plan import Episode
 
 ROOT = Path(__file__).parent.parent / "docs" / "leaderboard"
 sys.path.insert(0, str(ROOT.parent / "figures"))
@@ -23,7 +24,7 @@ BOARD = json.loads((ROOT / "leaderboard.json").read_text("utf-8"))
 
 @pytest.mark.parametrize("line", LINES, ids=lambda line: f"{line['policy']} {line['disturbance']}")
 def test_a_slice_of_the_table_comes_out_again(line):
-    again = run_cell(make_board.plan_of(BOARD), Cell(*(line[name] for name in Cell._fields)))
+    again = run_episode(make_board.plan_of(BOARD), Episode.of_line(line))
     assert again["scenario_hash"] == line["scenario_hash"]
     fails = [any(robot["lost"] for robot in run["robots"]) for run in (again, line)]
     assert fails[0] == fails[1]

@@ -10,11 +10,11 @@ import pytest
 from safetensors.numpy import load_file, save
 
 from baselines import load_policy
-from baselines.benchmark.bench import policy_hash
 from baselines.cli import main
 from baselines.policies import learned
-from baselines.policies.card import Network, read_policy, write_policy
-from baselines.policies.registry import enter, make_policy
+from baselines.policies.card import read_policy, write_policy
+from baselines.policies.network import Network
+from baselines.policies.registry import fit_policy, make_policy, policy_hash
 from baselines.runs.run import run_policy
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import load_scenario
@@ -240,14 +240,14 @@ def test_an_unknown_name_is_told_with_those_there_are(tmp_path, monkeypatch):
 def test_truncated_weights_are_told(rest, tmp_path):
     path = written(tmp_path)
     path.write_bytes(path.read_bytes()[:rest])
-    assert "is not a whole safetensors file" in refusal(path)
+    assert "is not a complete safetensors file" in refusal(path)
 
 
 @pytest.mark.parametrize("data", [b"PK\x03\x04 a zip", b"\x80\x04\x95 a pickle" * 9, b"{}"])
 def test_what_is_no_safetensors_file_is_told(data, tmp_path):
     path = written(tmp_path)
     path.write_bytes(data)
-    assert "is not a whole safetensors file" in refusal(path)
+    assert "is not a complete safetensors file" in refusal(path)
 
 
 def test_other_weights_than_the_cards_are_told(tmp_path):
@@ -351,7 +351,7 @@ def test_nothing_is_written_of_a_policy_that_is_wrong(tmp_path):
 def test_a_policy_that_does_not_fit_is_told_with_both(fields, said, tmp_path):
     path = str(written(tmp_path))
     scenario = load_scenario(**(SHORT | fields))
-    for make in (make_policy, enter):
+    for make in (make_policy, fit_policy):
         with pytest.raises(
             ValueError, match=r"^policy '.*policy\.safetensors' does not fit"
         ) as told:
@@ -370,19 +370,21 @@ def test_a_policy_that_does_not_fit_is_told_with_both(fields, said, tmp_path):
 def test_a_residual_needs_its_base_and_its_estimator(fields, said, tmp_path):
     path = str(written(tmp_path, scenario=RESIDUAL))
     with pytest.raises(ValueError, match="does not fit") as told:
-        enter(path, load_scenario(**(SHORT | fields)))
+        fit_policy(path, load_scenario(**(SHORT | fields)))
     assert said in str(told.value)
 
 
 def test_another_action_takes_whatever_estimator_is_set(tmp_path):
     path = str(written(tmp_path))
-    assert enter(path, load_scenario(estimator="truth", **SHORT)).scenario.privileged
+    assert fit_policy(path, load_scenario(estimator="truth", **SHORT)).scenario.privileged
 
 
 def test_an_entry_of_another_name_or_scale_is_told(tmp_path):
     path = written(tmp_path)
     change_card(path, lambda card: card | {"entries": card["entries"] | {"e_2": 400.0}})
-    with pytest.raises(ValueError, match=r"entry 1 is e_2 \(scale 400\).* \(scale 500\)"):
+    with pytest.raises(
+        ValueError, match=r"the entry 'e_2' with scale 400, the observation has scale 500"
+    ):
         make_policy(str(path), TWIST)
     path = written(tmp_path)
     change_card(path, lambda card: card | {"action_scales": [1000.0, 4.0]})
@@ -393,7 +395,7 @@ def test_an_entry_of_another_name_or_scale_is_told(tmp_path):
 def test_where_its_residual_counts_goes_with_a_policy(tmp_path):
     fading = load_scenario(RESIDUAL, residual_fade_mm=4.0, residual_reach_mm=90.0)
     path = str(written(tmp_path, scenario=fading))
-    _, scenario, overrides = enter(path, TWIST)
+    _, scenario, overrides = fit_policy(path, TWIST)
     assert (scenario.residual_fade_mm, scenario.residual_reach_mm) == (4.0, 90.0)
     assert overrides["residual_reach_mm"] == 90.0
     with pytest.raises(ValueError, match=r"residual_fade_mm 4.0, the scenario has 5.0"):
@@ -402,12 +404,13 @@ def test_where_its_residual_counts_goes_with_a_policy(tmp_path):
 
 def test_what_a_policy_asks_for_is_given_where_nobody_set_it(tmp_path):
     path = str(written(tmp_path, scenario=RESIDUAL))
-    policy, scenario, overrides = enter(path, TWIST)
-    assert overrides == {"action": "residual", "residual_base": "printed", "preview_s": [0.5]}
-    assert scenario == load_scenario(TWIST, **policy.scenario_overrides)
-    same = enter(path, RESIDUAL)
+    policy, scenario, overrides = fit_policy(path, TWIST)
+    assert overrides == {"action": "residual", "residual_base": "printed"}  # TWIST has its preview
+    assert scenario == load_scenario(TWIST, action="residual", residual_base="printed")
+    assert policy.scenario_overrides["preview_s"] == (0.5,)
+    same = fit_policy(path, RESIDUAL)
     assert (same.scenario, same.overrides) == (RESIDUAL, {})
-    assert enter("pure_pursuit", TWIST)[1:] == (TWIST, {})
+    assert fit_policy("pure_pursuit", TWIST)[1:] == (TWIST, {})
 
 
 def test_a_card_names_no_code_that_is_run(tmp_path):
@@ -415,7 +418,7 @@ def test_a_card_names_no_code_that_is_run(tmp_path):
     change_card(path, lambda card: card | {"estimator": "os:system"})
     assert "estimator" not in load_policy(path).scenario_overrides
     with pytest.raises(ValueError, match="estimator 'os:system', the scenario has 'ekf'"):
-        enter(str(path), TWIST)
+        fit_policy(str(path), TWIST)
 
 
 ASKING = """
@@ -449,23 +452,23 @@ def asking(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("asking")
 def test_a_policy_of_ones_own_may_ask_too():
-    assert enter("asking:Asking", TWIST).scenario is TWIST
-    entry = enter("asking:Sensing", TWIST)
-    assert (entry.scenario.observation, entry.scenario.action) == ("sensor", "residual")
-    assert entry.overrides["preview_s"] == []
-    assert enter("asking:Sensing", load_scenario(action="twist")).scenario.action == "twist"
+    assert fit_policy("asking:Asking", TWIST).scenario is TWIST
+    fitted = fit_policy("asking:Sensing", TWIST)
+    assert (fitted.scenario.observation, fitted.scenario.action) == ("sensor", "residual")
+    assert fitted.overrides["preview_s"] == []
+    assert fit_policy("asking:Sensing", load_scenario(action="twist")).scenario.action == "twist"
     with pytest.raises(ValueError, match="must map fields of action, observation"):
-        enter("asking:Greedy", TWIST)
+        fit_policy("asking:Greedy", TWIST)
     with pytest.raises(ValueError, match="policy 'asking:Odd' asks of the scenario: action: "):
-        enter("asking:Odd", TWIST)
+        fit_policy("asking:Odd", TWIST)
 
 
 def test_a_policy_that_asks_for_another_action_meets_the_same_draws(tmp_path):
     scenario = load_scenario(disturbance="start", horizon_s=2.0)
     still = {name: 0 * tensor for name, tensor in random_tensors(MLP).items()}
     needs = load_scenario(scenario, action="residual")
-    entry = enter(str(written(tmp_path, scenario=needs, tensors=still)), scenario)
-    mine = run_policy(entry.scenario, entry.policy, 20_000)
+    fitted = fit_policy(str(written(tmp_path, scenario=needs, tensors=still)), scenario)
+    mine = run_policy(fitted.scenario, fitted.policy, 20_000)
     reference = run_policy(scenario, make_policy("reference:consistent", scenario), 20_000)
     np.testing.assert_array_equal(mine["x_mm"][0], reference["x_mm"][0])
     np.testing.assert_allclose(mine["x_mm"], reference["x_mm"], atol=0.1)
@@ -496,7 +499,7 @@ def test_run_gives_a_policy_what_it_asks_for_and_says_so(tmp_path, monkeypatch, 
     words += ["--no-figures", "--out", "out"]
     run_tlf([*words, "--json"], monkeypatch)
     told = capsys.readouterr()
-    assert "as policy.safetensors asks: action residual, residual_base printed" in told.err
+    assert "policy.safetensors asks for action residual, residual_base printed" in told.err
     assert json.loads(told.out)["scenario"]["action"] == "residual"
     with pytest.raises(SystemExit) as end:
         run_tlf([*words, "--estimator", "truth"], monkeypatch)
@@ -516,11 +519,11 @@ def test_bench_compares_policies_that_act_otherwise(tmp_path, monkeypatch, capsy
     run_tlf(words, monkeypatch)
     capsys.readouterr()
     lines = [json.loads(line) for line in (tmp_path / "out/runs.jsonl").read_text().splitlines()]
-    asked = {"action": "residual", "residual_base": "printed", "preview_s": [0.5]}
+    asked = {"action": "residual", "residual_base": "printed"}
     assert [line["overrides"] for line in lines] == [{}, asked]
     assert lines[0]["scenario_hash"] != lines[1]["scenario_hash"]
     table = (tmp_path / "out/leaderboard.md").read_text()
-    assert "policy.safetensors (action residual; residual_base printed; preview_s 0.5)" in table
+    assert "policy.safetensors (action residual; residual_base printed)" in table
     change_card(tmp_path / "policy.safetensors", lambda card: card | {"command": "another"})
     with pytest.raises(SystemExit) as end:
         run_tlf(words, monkeypatch)

@@ -71,7 +71,7 @@ def test_every_page_comes_from_the_results_and_comes_out_again(made, checkout):
     assert readme.count("| `pure_pursuit` |") == 1
     page = first["docs/leaderboard.md"].decode()
     assert "![Scores](leaderboard/scores.png)" in page
-    assert "## reference:tuned against the best of the others" in page
+    assert "## reference:tuned against the best other policy" in page
 
 
 def test_the_slice_is_whole_lines_of_the_results(made, checkout):
@@ -167,7 +167,7 @@ def test_no_policy_is_best_where_all_runs_fail():
 
 
 def test_the_published_plan_can_be_run():
-    from baselines.benchmark.bench import read_plan
+    from baselines.benchmark.plan import read_plan
     from baselines.cli import PLAN_OPTIONS
 
     plan = read_plan("board", PLAN_OPTIONS)

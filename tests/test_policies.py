@@ -7,9 +7,14 @@ import numpy as np
 import pytest
 from stack_policy import StackPolicy
 
-from baselines.benchmark.bench import policy_hash
 from baselines.cli import main
-from baselines.policies.registry import enter, make_policy, overrides_told, policy_names
+from baselines.policies.registry import (
+    describe_overrides,
+    fit_policy,
+    make_policy,
+    policy_hash,
+    policy_names,
+)
 from baselines.runs.run import run_policy, run_seeds
 from tlf_env.envs.single import FormationEnv
 from tlf_env.onboard.controllers import controller, load_controller
@@ -85,17 +90,17 @@ def test_an_unknown_name_is_told(name):
 
 def test_the_tuned_reference_runs_on_an_estimate_of_the_slip():
     assert "reference:tuned" in policy_names()
-    entry = enter("reference:tuned", SCENARIO)
-    assert entry.overrides == {"estimator": "ekf-slip"}
-    assert entry.scenario == load_scenario(SCENARIO, estimator="ekf-slip")
+    fitted = fit_policy("reference:tuned", SCENARIO)
+    assert fitted.overrides == {"estimator": "ekf-slip"}
+    assert fitted.scenario == load_scenario(SCENARIO, estimator="ekf-slip")
     for name in ("reference", "reference:printed"):
-        assert enter(name, SCENARIO).overrides == {}
+        assert fit_policy(name, SCENARIO).overrides == {}
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "truth", "ekf-slip"])
 def test_an_estimator_that_is_set_stands(estimator):
-    entry = enter("reference:tuned", load_scenario(horizon_s=0.2, estimator=estimator))
-    assert (entry.overrides, entry.scenario.estimator) == ({}, estimator)
+    fitted = fit_policy("reference:tuned", load_scenario(horizon_s=0.2, estimator=estimator))
+    assert (fitted.overrides, fitted.scenario.estimator) == ({}, estimator)
 
 
 @pytest.mark.parametrize(
@@ -110,22 +115,22 @@ def test_an_estimator_that_is_set_stands(estimator):
 def test_a_controller_may_come_from_a_file(text, overrides, tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text(text)
-    entry = enter(f"reference:{path}", SCENARIO)
-    assert entry.overrides == overrides
-    assert entry.policy.controller == load_controller(path).controller
-    assert np.isfinite(run_policy(entry.scenario, entry.policy)["x_mm"]).all()
+    fitted = fit_policy(f"reference:{path}", SCENARIO)
+    assert fitted.overrides == overrides
+    assert fitted.policy.controller == load_controller(path).controller
+    assert np.isfinite(run_policy(fitted.scenario, fitted.policy)["x_mm"]).all()
 
 
 def test_a_controller_file_may_ask_for_its_filter(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("controller: tuned\nekf_slip: {fix_variance_mm2: 0.7}")
-    entry = enter(f"reference:{path}", SCENARIO)
-    assert entry.scenario.estimator == "ekf-slip"
-    assert entry.scenario.ekf_slip.fix_variance_mm2 == 0.7
-    assert entry.overrides["ekf_slip"] == entry.scenario.ekf_slip.model_dump()
-    assert overrides_told(entry.overrides) == ["estimator ekf-slip", "ekf_slip of its own"]
+    fitted = fit_policy(f"reference:{path}", SCENARIO)
+    assert fitted.scenario.estimator == "ekf-slip"
+    assert fitted.scenario.ekf_slip.fix_variance_mm2 == 0.7
+    assert fitted.overrides["ekf_slip"] == fitted.scenario.ekf_slip.model_dump()
+    assert describe_overrides(fitted.overrides) == ["estimator ekf-slip", "own ekf_slip"]
     mine = load_scenario(SCENARIO, ekf_slip={"fix_variance_mm2": 0.2}, estimator="ekf-slip")
-    assert enter(f"reference:{path}", mine).scenario == mine
+    assert fit_policy(f"reference:{path}", mine).scenario == mine
 
 
 @pytest.mark.parametrize(
@@ -310,14 +315,22 @@ def test_the_command_line_tells_a_wrong_part_in_one_line(words, monkeypatch, cap
 
 
 def test_a_run_warns_of_the_scenario_that_the_policy_asks_for(monkeypatch, capsys, tmp_path):
-    (tmp_path / "asking.py").write_text(
+    (tmp_path / "wide_asking.py").write_text(
         MODULE + "\nclass Sensing(Still):\n    scenario_overrides = {'observation': 'sensor'}\n"
     )
     (tmp_path / "wide.yaml").write_text(
         "trajectory: {type: circle, radius_mm: 1000, speed_mm_s: 100, centre_x_mm: 20000}\n"
     )
     monkeypatch.chdir(tmp_path)
-    words = ["run", "wide.yaml", "--policy", "asking:Sensing", "--no-figures", "--horizon-s", "0.2"]
+    words = [
+        "run",
+        "wide.yaml",
+        "--policy",
+        "wide_asking:Sensing",
+        "--no-figures",
+        "--horizon-s",
+        "0.2",
+    ]
     monkeypatch.setattr(sys, "argv", ["tlf", *words])
     main()
     assert "tlf: warning: t = 0 s: robot_0 starts at (21000, 0) mm" in capsys.readouterr().err

@@ -5,7 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from baselines.speed import speed
+from baselines.speed import parts, speed
+from baselines.speed.environments import ALONE, MPE2, VECTOR, VMAS
+from baselines.speed.moments import DRIVEN, Moments
 from tlf_env import BatchPlant
 from tlf_env.engine.arrays import make_arrays, padded
 from tlf_env.engine.formation import reference_table
@@ -23,9 +25,9 @@ def measured():
 def test_every_environment_is_measured_and_compared(measured):
     found = {tuple(row[key] for key in KEYS): row for row in measured["results"]}
     for robots in speed.ROBOTS:
-        assert (speed.ALONE, robots, 1, 1) in found
+        assert (ALONE, robots, 1, 1) in found
         for place in ((1, 1), (3, 1), (3, 2)):
-            assert (speed.VECTOR, robots, *place) in found
+            assert (VECTOR, robots, *place) in found
     for row in found.values():
         assert 0 < row["min"] <= row["env_steps_per_s"] <= row["max"]
         assert row["agent_steps_per_s"] == pytest.approx(
@@ -36,7 +38,7 @@ def test_every_environment_is_measured_and_compared(measured):
     json.dumps(measured, allow_nan=False)
 
 
-@pytest.mark.parametrize(("package", "name"), [("mpe2", speed.MPE2), ("vmas", speed.VMAS)])
+@pytest.mark.parametrize(("package", "name"), [("mpe2", MPE2), ("vmas", VMAS)])
 def test_peers_are_measured_where_they_are_installed(measured, package, name):
     pytest.importorskip(package)
     assert any(row["env"] == name for row in measured["results"])
@@ -47,7 +49,7 @@ def test_peers_are_measured_where_they_are_installed(measured, package, name):
 
 def test_without_peers_and_batches_only_our_own_formations_are_timed():
     found = speed.measure(2, 1, formations=(), peers=False, parts=False)
-    assert {row["env"] for row in found["results"]} == {speed.ALONE, "tlf_env/wide-circle-v0"}
+    assert {row["env"] for row in found["results"]} == {ALONE, "tlf_env/wide-circle-v0"}
     assert found["ratios"] == []
 
 
@@ -61,12 +63,12 @@ def test_numbers_below_one_are_refused(wrong):
 
 @pytest.fixture(scope="module")
 def moments():
-    return speed.Moments(3, kept=10)
+    return Moments(3, kept=10)
 
 
 def test_formations_are_put_where_the_recorded_ones_stood(moments):
     count = len(moments.lanes)
-    plant = BatchPlant("infinity", 3 * count, robots=3, end_on=(), **speed.DRIVEN)
+    plant = BatchPlant("infinity", 3 * count, robots=3, end_on=(), **DRIVEN)
     plant.reset(seed=0)
     moments.spread(plant)
     assert plant.step_counts.tolist() == np.repeat([1000, 1100, 1200], count).tolist()
@@ -79,7 +81,7 @@ def test_formations_are_put_where_the_recorded_ones_stood(moments):
 
 
 def test_recorded_actions_go_on_where_the_reference_went(moments):
-    runs = [BatchPlant("infinity", 100, robots=3, end_on=(), **speed.DRIVEN) for _ in range(2)]
+    runs = [BatchPlant("infinity", 100, robots=3, end_on=(), **DRIVEN) for _ in range(2)]
     for plant in runs:
         plant.reset(seed=0)
         moments.spread(plant)
@@ -91,8 +93,8 @@ def test_recorded_actions_go_on_where_the_reference_went(moments):
 
 
 def test_parts_of_a_step_are_told(monkeypatch):
-    monkeypatch.setattr(speed, "PARTS_FORMATIONS", 4)
-    found = speed._parts(3, 4, 1)["us_per_formation_step"]
+    monkeypatch.setattr(parts, "PARTS_FORMATIONS", 4)
+    found = parts.part_times(3, 4, 1)["us_per_formation_step"]
     assert set(found) == {
         "plant",
         "onboard",

@@ -64,20 +64,29 @@ def test_shipped_configs_are_valid(path: Path):
         ({"algorithm": "A2C"}, "algorithm: Input should be 'PPO', 'SAC' or 'RecurrentPPO'"),
         ({"robot_steps": 0}, "robot_steps: Input should be greater than or equal to 1, got 0"),
         ({"rollouts": 3}, "rollouts: unknown key"),
-        ({"seeds": [0, 20_001]}, "seeds 0:20001 must be a range within 0:10000"),
-        ({"seeds": [5, 5]}, "seeds 5:5 must be a range within 0:10000"),
+        (
+            {"seeds": [0, 20_001]},
+            "seeds 0 to 20000 must lie within 0 to 9999: seeds 0 to 9999 train and tune",
+        ),
+        ({"seeds": [5, 5]}, "seeds 5:5 must be FIRST:END with FIRST below END"),
         (
             {"evaluation": {**CONFIG["evaluation"], "seeds": [20_000, 20_050]}},
-            "evaluation seeds 20000:20050 must be a range within 10000:20000",
+            "evaluation seeds 20000 to 20049 must lie within 10000 to 19999",
         ),
         ({"disturbances": {"storm": 1}}, "disturbance 'storm' is not one of"),
         ({"disturbances": {"slip": 0}}, "at least one share must be above 0"),
         ({"tasks": {"square": {}}}, "scenario 'square' is not one of"),
         ({"tasks": {"infinity": {"speed": 1}}}, "speed: unknown key"),
-        ({"network": {"lstm": 8}}, "network.lstm is for RecurrentPPO and needed there; got 8"),
-        ({"algorithm": "RecurrentPPO"}, "network.lstm is for RecurrentPPO and needed there"),
-        ({"settings": {"seed": 3}}, "settings.seed is set elsewhere"),
-        ({"algorithm": "SAC", "imitation": {}}, "imitation is for PPO, not for SAC"),
+        (
+            {"network": {"lstm": 8}},
+            "RecurrentPPO, and no other algorithm, needs network.lstm; got 8",
+        ),
+        (
+            {"algorithm": "RecurrentPPO"},
+            "RecurrentPPO, and no other algorithm, needs network.lstm; got None",
+        ),
+        ({"settings": {"seed": 3}}, "settings.seed is set by the training"),
+        ({"algorithm": "SAC", "imitation": {}}, "imitation needs algorithm PPO, got SAC"),
     ],
 )
 def test_a_wrong_config_is_told_in_one_line(changes: dict, said: str):
@@ -119,7 +128,7 @@ class TestTraining:
 
     @pytest.mark.parametrize("name", ALGORITHMS)
     def test_an_interrupted_training_goes_on_to_the_same_policy(self, name, tmp_path):
-        from baselines.training.train import CHECKPOINT, POLICY, train
+        from baselines.training.train import CHECKPOINT_FILE, POLICY_FILE, train
 
         config = load_config({**CONFIG, **ALGORITHMS[name]})
         whole = train(config, 3, tmp_path / "whole")
@@ -134,19 +143,19 @@ class TestTraining:
         for _ in range(2):
             with pytest.raises(KeyboardInterrupt):
                 train(config, 3, parts, progress=interrupt)
-            assert (parts / CHECKPOINT).exists()
+            assert (parts / CHECKPOINT_FILE).exists()
         again = train(config, 3, parts)
         for curve in (whole, again):
             del curve["wall_time_s"]
         assert whole == again
         assert len(whole["evaluations"]) >= 3
-        assert (parts / POLICY).read_bytes() == (tmp_path / "whole" / POLICY).read_bytes()
-        assert (parts / CHECKPOINT).stat().st_size == (
-            tmp_path / "whole" / CHECKPOINT
+        assert (parts / POLICY_FILE).read_bytes() == (tmp_path / "whole" / POLICY_FILE).read_bytes()
+        assert (parts / CHECKPOINT_FILE).stat().st_size == (
+            tmp_path / "whole" / CHECKPOINT_FILE
         ).stat().st_size
 
     def test_a_killed_training_goes_on_from_its_last_checkpoint(self, tmp_path):
-        from baselines.training.train import POLICY, train
+        from baselines.training.train import POLICY_FILE, train
 
         config = load_config(CONFIG)
 
@@ -160,29 +169,29 @@ class TestTraining:
         whole = train(config, 3, tmp_path / "whole")
         assert again["evaluations"] == whole["evaluations"]
         assert again["rollouts"] == whole["rollouts"]
-        assert (tmp_path / "parts" / POLICY).read_bytes() == (
-            tmp_path / "whole" / POLICY
+        assert (tmp_path / "parts" / POLICY_FILE).read_bytes() == (
+            tmp_path / "whole" / POLICY_FILE
         ).read_bytes()
 
     def test_the_first_policy_is_the_reference_and_the_kept_one_the_best(self, tmp_path):
         from baselines import ReferencePolicy
-        from baselines.training.evaluate import evaluate
+        from baselines.training.curve import kept_evaluation
+        from baselines.training.scoring import score_policy
         from baselines.training.train import train
-        from baselines.training.train_seeds import kept
 
         config = load_config({**CONFIG, "network": {"hidden": [16], "action_gain": 1e-9}})
         curve = train(config, 0, tmp_path)
         twist = load_config({**CONFIG, "scenario": {**CONFIG["scenario"], "action": "twist"}})
         seeds = range(*CONFIG["evaluation"]["seeds"])
         policy = ReferencePolicy("tuned", preview_s=(0.5,))
-        reference = evaluate(policy, twist.evaluation_scenarios(), seeds)
+        reference = score_policy(policy, twist.evaluation_scenarios(), seeds)
         for name, cell in curve["evaluations"][0]["cells"].items():
             assert cell["score_mm"] == pytest.approx(reference[name].score_mm, rel=1e-4)
         policy = load_policy(tmp_path / "policy.safetensors")
-        assert policy.card.scores["kept"] == kept(curve)
+        assert policy.card.scores["kept"] == kept_evaluation(curve)
         assert policy.card.residual_base == "tuned"
-        found = evaluate(policy, config.evaluation_scenarios(), seeds)
-        for name, cell in kept(curve)["cells"].items():
+        found = score_policy(policy, config.evaluation_scenarios(), seeds)
+        for name, cell in kept_evaluation(curve)["cells"].items():
             assert found[name].score_mm == pytest.approx(cell["score_mm"], rel=1e-3)
 
     def test_imitation_brings_the_network_near_the_reference(self):
@@ -190,7 +199,7 @@ class TestTraining:
 
         from baselines import ReferencePolicy
         from baselines.training.imitation import imitate
-        from baselines.training.train import make_envs, make_model, spread_out
+        from baselines.training.model import make_envs, make_model, spread_out
 
         fields = {**SHORT, "horizon_s": 10.0, "action": "twist", "estimator": "ekf-slip"}
         config = load_config(
@@ -214,7 +223,7 @@ class TestTraining:
     def test_after_the_first_round_of_an_imitation_the_network_drives(self, monkeypatch):
         """And the teacher still says what it should have done; no round gets lost."""
         from baselines.training import imitation
-        from baselines.training.train import make_envs, make_model
+        from baselines.training.model import make_envs, make_model
 
         fields = {**SHORT, "horizon_s": 10.0, "action": "twist", "estimator": "ekf-slip"}
         config = load_config(
@@ -260,11 +269,11 @@ class TestTraining:
 
     @pytest.mark.parametrize("damage", ["cut", "text", "other"])
     def test_a_damaged_checkpoint_is_told_in_one_line(self, damage, tmp_path):
-        from baselines.training.train import CHECKPOINT, train
+        from baselines.training.train import CHECKPOINT_FILE, train
 
         config = load_config(CONFIG)
         train(config, 0, tmp_path)
-        path = tmp_path / CHECKPOINT
+        path = tmp_path / CHECKPOINT_FILE
         if damage == "cut":
             path.write_bytes(path.read_bytes()[:-100])
         elif damage == "text":
@@ -272,8 +281,8 @@ class TestTraining:
         else:
             other = load_config({**CONFIG, "network": {"hidden": [8]}})
             train(other, 0, tmp_path / "other")
-            path.write_bytes((tmp_path / "other" / CHECKPOINT).read_bytes())
-        with pytest.raises(ValueError, match="cannot be gone on from") as error:
+            path.write_bytes((tmp_path / "other" / CHECKPOINT_FILE).read_bytes())
+        with pytest.raises(ValueError, match="cannot resume from") as error:
             train(config, 0, tmp_path)
         assert "\n" not in str(error.value)
 
@@ -281,7 +290,7 @@ class TestTraining:
         ("settings", "said"),
         [
             ({"n_step": 10}, "settings.n_step is not one of"),
-            ({"n_steps": "many"}, "settings: PPO says"),
+            ({"n_steps": "many"}, "settings: PPO refuses them"),
         ],
     )
     def test_settings_that_the_algorithm_refuses(self, settings, said, tmp_path):

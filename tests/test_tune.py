@@ -15,19 +15,13 @@ pytest.importorskip("optuna")
 
 from baselines.cli import main
 from baselines.policies.reference import ReferencePolicy
-from baselines.policies.registry import enter
-from baselines.tuning import tune
-from baselines.tuning.tune import (
-    CAPS,
-    Job,
-    Objective,
-    Outcome,
-    Study,
-    TuneConfig,
-    evaluate,
-    load_tune,
-    run_tune,
-)
+from baselines.policies.registry import fit_policy
+from baselines.runs.run import run_seeds
+from baselines.tuning import search
+from baselines.tuning.config import CAPS, Objective, TuneConfig, load_tune
+from baselines.tuning.search import RESULT_FILE, run_tune
+from baselines.tuning.study import SCORES, STUDY_FILE, StoredStudy
+from baselines.tuning.trial import Outcome, TrialJob, measured, run_trial
 from tlf_env.onboard.controllers import controller, load_controller
 from tlf_env.task.scenario import load_scenario
 
@@ -60,7 +54,7 @@ SMALL = {
     "startup_trials": 3,
     "objective": {"settled_formation_rmse_mm": 0},
 }
-COMMAND = [sys.executable, "-c", "from baselines.cli import main; main()", "tune"]
+COMMAND = [sys.executable, "-m", "baselines", "tune"]
 
 
 def config(**fields):
@@ -68,7 +62,7 @@ def config(**fields):
 
 
 def quick(settings, job):
-    """A drive that takes no time: high gains fail on noise."""
+    """A trial that takes no time: high gains fail on noise."""
     gain, variance = job.values["gains.k_1_per_s"], job.values["ekf_slip.fix_variance_mm2"]
     strata, total = {}, 0
     for i, place in enumerate(("infinity, nominal", "infinity, noise")):
@@ -86,7 +80,7 @@ def trials(folder, settings):
     """Everything about the trials but when they were."""
     return [
         (t.number, t.state.name, t.params, t.value, t.user_attrs)
-        for t in Study(settings, folder).trials()
+        for t in StoredStudy(settings, folder).trials()
     ]
 
 
@@ -95,7 +89,7 @@ def whole(tmp_path_factory):
     """Folder and result of a search that nobody interrupted."""
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tune, "evaluate", quick)
+        patch.setattr(search, "run_trial", quick)
         return folder, run_tune(config(), folder)
 
 
@@ -108,7 +102,7 @@ def test_a_search_that_is_interrupted_is_the_search_that_was_not(tmp_path, monke
             raise KeyboardInterrupt
         return quick(settings, job)
 
-    monkeypatch.setattr(tune, "evaluate", drive)
+    monkeypatch.setattr(search, "run_trial", drive)
     while left:
         finished = left[0]
         with pytest.raises(KeyboardInterrupt):
@@ -117,7 +111,7 @@ def test_a_search_that_is_interrupted_is_the_search_that_was_not(tmp_path, monke
         assert len([s for s in states if s in ("COMPLETE", "PRUNED")]) == finished
     assert run_tune(config(), tmp_path) == whole[1]
     assert trials(tmp_path, config()) == trials(whole[0], config())
-    written = [(folder / tune.RESULT).read_text() for folder in (tmp_path, whole[0])]
+    written = [(folder / RESULT_FILE).read_text() for folder in (tmp_path, whole[0])]
     assert written[0] == written[1]
 
 
@@ -126,8 +120,8 @@ def test_a_trial_that_was_driven_and_not_stored_whole_is_driven_again(
     tmp_path, monkeypatch, whole, write
 ):
     """The process may end between any two writes to the database."""
-    monkeypatch.setattr(tune, "evaluate", quick)
-    study = Study(config(), tmp_path)
+    monkeypatch.setattr(search, "run_trial", quick)
+    study = StoredStudy(config(), tmp_path)
 
     real = getattr(study._study._storage, write)
 
@@ -154,7 +148,7 @@ def test_what_is_finished_is_not_driven_again_and_more_trials_go_on(tmp_path, mo
         driven.append((job.number, job.seeds[0]))
         return quick(settings, job)
 
-    monkeypatch.setattr(tune, "evaluate", drive)
+    monkeypatch.setattr(search, "run_trial", drive)
     run_tune(config(trials=4), tmp_path)
     before = len(driven)
     run_tune(config(trials=4), tmp_path)
@@ -175,9 +169,11 @@ def test_what_is_finished_is_not_driven_again_and_more_trials_go_on(tmp_path, mo
     ],
 )
 def test_another_search_in_the_same_folder_is_refused(tmp_path, monkeypatch, change, named):
-    monkeypatch.setattr(tune, "evaluate", quick)
-    Study(config(), tmp_path)
-    with pytest.raises(ValueError, match=f"holds a search of another {named}; take another --out"):
+    monkeypatch.setattr(search, "run_trial", quick)
+    StoredStudy(config(), tmp_path)
+    with pytest.raises(
+        ValueError, match=f"holds a search of another {named}; choose another --out"
+    ):
         run_tune(config(**change), tmp_path)
 
 
@@ -185,26 +181,26 @@ def test_a_task_whose_file_changed_is_refused(tmp_path):
     path = tmp_path / "round.yaml"
     text = "trajectory: {{type: circle, radius_mm: 800, speed_mm_s: {}}}\n"
     path.write_text(text.format(200))
-    Study(config(tasks=[str(path)]), tmp_path / "out")
+    StoredStudy(config(tasks=[str(path)]), tmp_path / "out")
     path.write_text(text.format(300))
     with pytest.raises(ValueError, match="holds a search of another scenarios"):
-        Study(config(tasks=[str(path)]), tmp_path / "out")
+        StoredStudy(config(tasks=[str(path)]), tmp_path / "out")
 
 
 def test_two_at_once_in_a_folder_are_refused(tmp_path, monkeypatch):
     def drive(settings, job):
-        with pytest.raises(ValueError, match="another process is at work in"):
+        with pytest.raises(ValueError, match="another process works in"):
             run_tune(config(), tmp_path)
         return quick(settings, job)
 
-    monkeypatch.setattr(tune, "evaluate", drive)
+    monkeypatch.setattr(search, "run_trial", drive)
     assert run_tune(config(trials=1), tmp_path) == run_tune(config(trials=1), tmp_path)
 
 
 def test_a_database_that_is_none_is_told(tmp_path):
-    (tmp_path / tune.STUDY).write_bytes(b"no database, " * 100)
+    (tmp_path / STUDY_FILE).write_bytes(b"no database, " * 100)
     with pytest.raises(ValueError, match=r"study\.db cannot be read"):
-        Study(config(), tmp_path)
+        StoredStudy(config(), tmp_path)
 
 
 def test_the_seeds_for_choosing_choose(tmp_path, monkeypatch):
@@ -217,7 +213,7 @@ def test_the_seeds_for_choosing_choose(tmp_path, monkeypatch):
         assert job.too_many == {}
         return outcome._replace(score=-outcome.score)
 
-    monkeypatch.setattr(tune, "evaluate", drive)
+    monkeypatch.setattr(search, "run_trial", drive)
     found = run_tune(config(), tmp_path)["found"]
     assert len(found["finalists"]) in (2, 3)  # the start too, if it is not among the best
     assert 0 in [row["trial"] for row in found["finalists"]]
@@ -229,12 +225,12 @@ def test_the_seeds_for_choosing_choose(tmp_path, monkeypatch):
 
 
 def test_a_trial_that_fails_more_than_the_start_is_stopped(tmp_path, monkeypatch):
-    monkeypatch.setattr(tune, "evaluate", quick)
+    monkeypatch.setattr(search, "run_trial", quick)
     run_tune(config(trials=12), tmp_path)
     for _, state, values, _, attributes in trials(tmp_path, config(trials=12)):
         fails = values["gains.k_1_per_s"] > 1.5
         assert state == ("PRUNED" if fails else "COMPLETE")
-        assert len(attributes[tune.SCORES]["strata"]) == (1 if fails else 2)
+        assert len(attributes[SCORES]["strata"]) == (1 if fails else 2)
 
 
 def test_a_failed_run_costs_more_than_any_other():
@@ -250,24 +246,24 @@ def test_a_failed_run_costs_more_than_any_other():
 def test_the_result_is_a_controller_that_scores_the_same(tmp_path):
     settings = config(trials=3, startup_trials=1)
     result = run_tune(settings, tmp_path, command="tlf tune x.yaml")
-    found, path = result["found"], str(tmp_path / tune.RESULT)
-    assert yaml.safe_load((tmp_path / tune.RESULT).read_text()) == result
+    found, path = result["found"], str(tmp_path / RESULT_FILE)
+    assert yaml.safe_load((tmp_path / RESULT_FILE).read_text()) == result
     assert json.loads(json.dumps(result)) == result
-    study = Study(settings, tmp_path)
+    study = StoredStudy(settings, tmp_path)
     best = settings.built(study.values(found["trial"]))
     loaded = load_controller(path)
     assert (loaded.controller, loaded.ekf_slip) == (best.controller, best.ekf_slip)
     assert ReferencePolicy(path).controller == best.controller
-    entry = enter(f"reference:{path}", load_scenario(horizon_s=2.0, plant="batch"))
+    entry = fit_policy(f"reference:{path}", load_scenario(horizon_s=2.0, plant="batch"))
     assert entry.policy.controller == best.controller
     assert (entry.scenario.estimator, entry.scenario.ekf_slip) == ("ekf-slip", best.ekf_slip)
     json.dumps(entry.overrides)
-    (again,) = tune.run_seeds(entry.scenario, entry.policy, [0])
-    job = Job(0, study.values(found["trial"]), [0], {})
-    alone = evaluate(config(disturbances=["nominal"]), job).strata["infinity, nominal"]
-    assert tune.measured(again)[0] == {name: alone[name] for name in CAPS}
+    (again,) = run_seeds(entry.scenario, entry.policy, [0])
+    job = TrialJob(0, study.values(found["trial"]), [0], {})
+    alone = run_trial(config(disturbances=["nominal"]), job).strata["infinity, nominal"]
+    assert measured(again)[0] == {name: alone[name] for name in CAPS}
     set_by_hand = load_scenario(ekf_slip={"fix_variance_mm2": 0.5}, estimator="ekf")
-    assert enter(f"reference:{path}", set_by_hand).overrides == {}
+    assert fit_policy(f"reference:{path}", set_by_hand).overrides == {}
 
 
 @pytest.mark.slow
@@ -293,7 +289,7 @@ def test_a_search_that_is_killed_loses_no_finished_trial(tmp_path):
         )
 
     def finished(folder):
-        if not (folder / tune.STUDY).exists():
+        if not (folder / STUDY_FILE).exists():
             return []
         try:
             return [t for t in trials(folder, settings) if t[1] in ("COMPLETE", "PRUNED")]
@@ -420,7 +416,7 @@ def refused(words, tmp_path, monkeypatch, capsys):
 
 
 def test_the_command_prints_its_result(tmp_path, monkeypatch, capsys):
-    monkeypatch.setattr(tune, "evaluate", quick)
+    monkeypatch.setattr(search, "run_trial", quick)
     monkeypatch.chdir(tmp_path)
     (tmp_path / "search.yaml").write_text(yaml.safe_dump(SMALL))
     printed = []
@@ -430,7 +426,7 @@ def test_the_command_prints_its_result(tmp_path, monkeypatch, capsys):
         printed.append(capsys.readouterr().out)
     result = json.loads(printed[0])
     folder = tmp_path / "results" / "tune" / "search"
-    assert yaml.safe_load((folder / tune.RESULT).read_text())["found"]["search"]["trials"] == 7
+    assert yaml.safe_load((folder / RESULT_FILE).read_text())["found"]["search"]["trials"] == 7
     assert result["found"]["command"] == "tlf tune search.yaml --json --trials 3"
     assert result["found"]["search"]["trials"] == 3
     assert "less is better" in printed[1]
@@ -441,7 +437,7 @@ def test_an_interrupt_is_told_and_no_success(tmp_path, monkeypatch, capsys):
     def drive(settings, job):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tune, "evaluate", drive)
+    monkeypatch.setattr(search, "run_trial", drive)
     monkeypatch.setattr(sys, "argv", ["tlf", "tune", "tuned", "--out", str(tmp_path)])
     with pytest.raises(SystemExit) as end:
         main()
@@ -452,7 +448,7 @@ def test_an_interrupt_is_told_and_no_success(tmp_path, monkeypatch, capsys):
 def test_the_start_is_the_first_trial(tmp_path):
     """Whatever the search finds is at least as good on the seeds for choosing."""
     settings = load_tune("tuned")
-    job = next(Study(settings, tmp_path).jobs())
+    job = next(StoredStudy(settings, tmp_path).jobs())
     file = settings.built(job.values)
     assert (job.number, file.controller) == (0, controller("tuned"))
     assert file.ekf_slip == settings.ekf_slip

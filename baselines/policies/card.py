@@ -1,7 +1,7 @@
 """A learned policy on disk: its tensors in ``NAME.safetensors``, and its card in ``NAME.json``.
 
-The card says what the network is, what it sees and does, and how it was made. Neither file can hold
-code, so that a policy of somebody else's is read without trust.
+The card describes the network, its observation and action, and how it was made. Neither file can hold
+code, so a policy from an unknown source can be loaded safely.
 """
 
 from __future__ import annotations
@@ -17,83 +17,46 @@ from pydantic import Field, JsonValue, ValidationError, model_validator
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from baselines.policies.columns import Columns, find_scaled_columns
+from baselines.policies.network import NORMALISATION, Network
 from tlf_env.common.errors import one_line
 from tlf_env.common.files import atomic
 from tlf_env.common.models import Frozen, NonNegative, Positive
-from tlf_env.task.actions import ACTION_ENTRIES, ACTION_SIZE
-from tlf_env.task.observation import sensor_entries, tracking_entries
+from tlf_env.task.actions import ACTION_ENTRIES
+from tlf_env.task.observation import SAMPLE_ENTRIES, sensor_entries, tracking_entries
 from tlf_env.task.scenario import Scenario
 
 FORMAT_VERSION: Final = 1
 WEIGHTS, CARD = ".safetensors", ".json"
-NORMALISATION = "normalise."
-LSTM_GATES = 4  # input, forget, cell, output, in this order
 
-Size = Annotated[int, Field(ge=1)]
 Word = Annotated[str, Field(min_length=1)]
 Tensors = Mapping[str, np.ndarray]
 
 
-class Network(Frozen):
-    """What is computed: normalisation, an LSTM, hidden layers and a linear head, in this order.
-
-    Tensors are named and shaped as :meth:`shapes` says; a weight is (out, in), as in torch.
-    """
-
-    hidden: tuple[Size, ...]  # sizes of the hidden layers
-    activation: Literal["tanh", "relu"]  # after each of them
-    lstm: Size | None = None  # size of its state; None without one
-    head: Literal["gaussian", "squashed_gaussian"]  # the latter: tanh of the draw, as SAC does
-    normalised: bool = False  # whether observations are, as VecNormalize does
-
-    def shapes(self, entries: int) -> dict[str, tuple[int, ...]]:
-        """Shapes of all tensors by name, for an observation of so many entries.
-
-        ``normalise.*`` are float64, as VecNormalize keeps them; all others are float32.
-        """
-        shapes: dict[str, tuple[int, ...]] = {}
-        if self.normalised:
-            shapes |= {f"{NORMALISATION}{name}": (entries,) for name in ("mean", "var")}
-            shapes |= {f"{NORMALISATION}{name}": () for name in ("epsilon", "clip")}
-        size = entries
-        if self.lstm is not None:
-            gates = LSTM_GATES * self.lstm
-            shapes |= {"lstm.weight_ih": (gates, size), "lstm.weight_hh": (gates, self.lstm)}
-            shapes |= {"lstm.bias_ih": (gates,), "lstm.bias_hh": (gates,)}
-            size = self.lstm
-        for i, width in enumerate(self.hidden):
-            shapes |= {f"hidden.{i}.weight": (width, size), f"hidden.{i}.bias": (width,)}
-            size = width
-        shapes |= {"mean.weight": (ACTION_SIZE, size), "mean.bias": (ACTION_SIZE,)}
-        if self.head == "gaussian":
-            return shapes | {"log_std": (ACTION_SIZE,)}
-        return shapes | {"log_std.weight": (ACTION_SIZE, size), "log_std.bias": (ACTION_SIZE,)}
-
-
 class Card(Frozen):
-    """Everything that is told of a learned policy. Times in s."""
+    """Description of a learned policy. Times in s."""
 
     format_version: Literal[1]
-    algorithm: Word  # PPO, SAC, RecurrentPPO, or what one's own trainer is called
+    algorithm: Word  # PPO, SAC, RecurrentPPO, or the name of another trainer
 
     # What it was trained with, and has to be run with.
     action: Literal["twist", "wheel_speed", "torque", "residual"]
-    action_scales: tuple[Positive, Positive]  # what 1.0 means: mm/s, rad/s, N·mm
+    action_scales: tuple[Positive, Positive]  # value of 1.0: mm/s, rad/s, N·mm
     observation: Literal["tracking", "sensor"]
-    entries: dict[str, Positive]  # of the observation, in order, and the value that is scaled to 1
+    entries: dict[str, Positive]  # that the policy takes, in its order, with their scales
     preview_s: tuple[NonNegative, ...]  # () for sensor, which has none
     control_period_s: Positive
-    residual_base: Word | None = None  # gains that a residual is added to
+    residual_base: Word | None = None  # gains of the base that a residual is added to
     residual_fade_mm: NonNegative = 0.0  # estimated errors at which the residual counts half
     residual_reach_mm: Positive | None = None
-    estimator: Word | None = None  # None: whatever the scenario has
+    estimator: Word | None = None  # None: the scenario's
 
     network: Network
 
-    # How it was made: a record, which nothing reads.
+    # How it was made: a record that no code reads.
     scenario: dict[str, JsonValue]  # the whole scenario of the training
     training: dict[str, JsonValue]  # settings of the algorithm, environment steps, wall time
-    seeds: dict[str, tuple[int, ...]]  # what was seeded, and with what
+    seeds: dict[str, tuple[int, ...]]  # seeds of everything that was seeded
     versions: dict[str, str]
     scores: dict[str, JsonValue]
     command: str  # that made it
@@ -108,49 +71,80 @@ class Card(Frozen):
                 f"{self.residual_base!r} with {self.action!r}"
             )
         if self.action == "residual" and self.estimator is None:
-            raise ValueError("estimator must be named where the action is 'residual'")
+            raise ValueError("estimator must be named if the action is 'residual'")
         return self
 
-    def check_fit(self, name: str, scenario: Scenario) -> None:
-        """Check that a scenario is what the policy was trained for.
+    @property
+    def samples(self) -> int:
+        """Samples of a ``sensor`` observation; 0 for ``tracking``."""
+        first = f"{next(iter(SAMPLE_ENTRIES))}_"
+        return sum(name.startswith(first) for name in self.entries)
 
-        The estimator counts where the action is a residual; with another action the policy runs on
-        whatever the scenario has.
+    def fit(self, name: str, scenario: Scenario) -> Columns:
+        """The columns of a scenario's observation that the policy takes, found by name.
+
+        The observation may have further entries, in another order, and further previews. The estimator
+        counts only if the action is a residual; other policies run with the scenario's estimator.
 
         Raises
         ------
         ValueError
-            naming the first difference, and what both have.
+            naming the first difference that the policy cannot run with, and both values.
         """
         theirs = interface(scenario)
-        for field in theirs:
-            mine, its = getattr(self, field), theirs[field]
-            if field == "estimator" and self.action != "residual":
-                continue
-            if field == "entries":
-                mine, its = _first_difference(list(mine.items()), list(its.items()))
-            if mine != its:
+        if set(self.preview_s) <= set(theirs["preview_s"]):
+            theirs["preview_s"] = self.preview_s
+        if self.action != "residual":
+            theirs["estimator"] = self.estimator
+        offered = theirs.pop("entries")
+        try:
+            for field, value in theirs.items():
+                if getattr(self, field) != value:
+                    raise ValueError(
+                        f"it was trained with {field} {getattr(self, field)!r}, the scenario has "
+                        f"{value!r}"
+                    )
+            if self.samples and self.samples != scenario.substeps:
                 raise ValueError(
-                    f"policy {name!r} does not fit the scenario: it was trained with {field} "
-                    f"{mine!r}, the scenario has {its!r}"
+                    f"it was trained with {self.samples} samples in an observation, the scenario has "
+                    f"{scenario.substeps}"
                 )
+            return find_scaled_columns(self.entries, offered)
+        except ValueError as error:
+            raise ValueError(f"policy {name!r} does not fit the scenario: {error}") from error
+
+    def own_columns(self) -> Columns:
+        """The columns of the observation with the card's previews and samples, and nothing more.
+
+        Raises
+        ------
+        ValueError
+            naming an entry that the observation lacks, or that has another scale.
+        """
+        return find_scaled_columns(
+            self.entries, _scales(self.observation, self.preview_s, self.samples)
+        )
 
 
 class Loaded(NamedTuple):
-    """What the two files of a policy hold, checked."""
+    """Checked content of the two files of a policy."""
 
     card: Card
     tensors: dict[str, np.ndarray]
     files: tuple[Path, Path]
 
 
+def _scales(observation: str, preview_s: tuple[float, ...], samples: int) -> dict[str, float]:
+    """Entries of an observation and their scales, in order."""
+    tracking = observation == "tracking"
+    entries = tracking_entries(preview_s) if tracking else sensor_entries(samples)
+    return {name: entry.scale for name, entry in entries.items()}
+
+
 def interface(scenario: Scenario) -> dict[str, Any]:
-    """The fields of a card that a scenario fixes."""
-    tracking = scenario.observation == "tracking"
+    """The fields of a card that a scenario determines."""
     residual = scenario.action == "residual"
-    entries = (
-        tracking_entries(scenario.preview_s) if tracking else sensor_entries(scenario.substeps)
-    )
+    previews = scenario.preview_s if scenario.observation == "tracking" else ()
     return {
         "control_period_s": scenario.control_period_s,
         "action": scenario.action,
@@ -159,26 +153,10 @@ def interface(scenario: Scenario) -> dict[str, Any]:
         "residual_reach_mm": scenario.residual_reach_mm if residual else None,
         "estimator": scenario.estimator,
         "observation": scenario.observation,
-        "preview_s": scenario.preview_s if tracking else (),
-        "entries": {name: entry.scale for name, entry in entries.items()},
+        "preview_s": previews,
+        "entries": _scales(scenario.observation, previews, scenario.substeps),
         "action_scales": tuple(entry.scale for entry in ACTION_ENTRIES[scenario.action]),
     }
-
-
-def _first_difference(mine: list[Any], theirs: list[Any]) -> tuple[str, str]:
-    """How two lists of entries and scales differ, in words; twice the same if they do not."""
-    if mine == theirs:
-        return "", ""
-    i = next(
-        (i for i, pair in enumerate(zip(mine, theirs, strict=False)) if pair[0] != pair[1]),
-        min(len(mine), len(theirs)),
-    )
-
-    def told(items: list[Any]) -> str:
-        entry = f"{items[i][0]} (scale {items[i][1]:g})" if i < len(items) else "nothing"
-        return f"{len(items)} in all, entry {i} is {entry}"
-
-    return told(mine), told(theirs)
 
 
 def write_policy(
@@ -199,20 +177,21 @@ def write_policy(
     Parameters
     ----------
     tensors
-        As ``network.shapes(entries)`` says; kept as float32 (``normalise.*``: float64).
+        Tensors with the names and shapes of ``network.shapes(entries)``; stored as float32
+        (``normalise.*``: float64).
     scenario
-        What the policy was trained on; its action, observation and on-board parts are what the
-        policy will ask for.
+        The scenario of the training. The policy will ask for its action, observation and on-board
+        parts.
 
     Raises
     ------
     ValueError
         if the name does not end in ``.safetensors``, a tensor is missing, unknown, of a wrong shape
-        or not finite, or something told is not what a card can hold.
+        or not finite, or a value is not allowed in a card.
     """
     if path.suffix != WEIGHTS:
         raise ValueError(f"{path}: the name of a policy must end in {WEIGHTS}")
-    # safetensors writes the memory behind an array, whatever its strides.
+    # safetensors writes the memory of an array and ignores its strides.
     kept = {
         name: np.array(tensor, dtype=_dtype(name), order="C") for name, tensor in tensors.items()
     }
@@ -259,7 +238,7 @@ def read_policy(path: Path) -> Loaded:
         tensors = load(data)
     except (SafetensorError, KeyError, ValueError) as error:
         raise ValueError(
-            f"{path} is not a whole safetensors file of plain numbers: {_line(error)}"
+            f"{path} is not a complete safetensors file of plain numbers: {_line(error)}"
         ) from error
     found = hashlib.sha256(data).hexdigest()
     if found != card.weights_sha256:
@@ -319,7 +298,7 @@ def _bytes_of(path: Path, why: str) -> bytes:
 def _card(path: Path, data: bytes) -> Card:
     try:
         json.loads(data)
-    except ValueError as error:  # told here: pydantic's message would hold the whole file
+    except ValueError as error:  # here, as pydantic's message would contain the whole file
         raise ValueError(f"{path} is not JSON: {_line(error)}") from error
     try:
         return Card.model_validate_json(data, strict=True)

@@ -1,4 +1,4 @@
-"""Classical rivals of the paper's law, from the same ``tracking`` observation to the same ``twist``."""
+"""Classical alternatives to the paper's law, from the same ``tracking`` observation to the same ``twist``."""
 
 from __future__ import annotations
 
@@ -9,8 +9,7 @@ import numpy as np
 
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
-
-DEFAULT_PREVIEW_S = (0.5, 1.0)
+from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
 
 class _Memoryless(ABC):
@@ -39,7 +38,7 @@ class _Memoryless(ABC):
         Raises
         ------
         ValueError
-            if the observation has not the entries of ``tracking`` with this policy's previews.
+            if the observation does not have the entries of ``tracking`` with this policy's previews.
         """
         observation = np.asarray(observation)
         if observation.ndim not in (1, 2) or observation.shape[-1] != len(self._scales):
@@ -55,16 +54,16 @@ class _Memoryless(ABC):
 
 
 class PurePursuit(_Memoryless):
-    """Steer along the circle through the robot's place and its reference half a second from now.
+    """Steer along the circle through the robot's position and a later position of its reference.
 
     Coulter, "Implementation of the pure pursuit path tracking algorithm", CMU-RI-TR-92-01, 1992. The
-    speed is the reference's plus ``gain_per_s`` times the error ahead. The place in the future is the
-    observation's first preview.
+    speed is the reference's plus ``gain_per_s`` times the forward error. The later position is the
+    observation's first preview (by default 0.5 s ahead).
 
     Raises
     ------
     ValueError
-        if there is no preview, or the first is of now.
+        if there is no preview, or the first is at 0 s.
     """
 
     def __init__(
@@ -93,7 +92,7 @@ class FeedbackLinearisation(_Memoryless):
     """Input–output linearisation of a point ``ahead_mm`` in front of the axle.
 
     Siciliano et al., "Robotics: modelling, planning and control", Springer 2009, section 11.6.2. The
-    point can be given any velocity, so that its error decays with ``gain_per_s`` in every direction.
+    point can move in every direction, and its error decays with ``gain_per_s``.
     """
 
     def __init__(
@@ -107,7 +106,7 @@ class FeedbackLinearisation(_Memoryless):
         self.gain_per_s = gain_per_s
 
     def twist(self, seen: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-        """The twist that gives the point its wanted velocity."""
+        """The twist that gives the point the desired velocity."""
         b, sin, cos = self.ahead_mm, seen["sin_e_3"], seen["cos_e_3"]
         u_1, u_2 = seen["reference_u_1"], seen["reference_u_2"]
         forward = u_1 * cos - b * u_2 * sin + self.gain_per_s * (seen["e_1"] + b * (cos - 1.0))

@@ -1,9 +1,9 @@
 """Learned policies without their learning library: MLPs and LSTMs in compiled NumPy.
 
-A row of a batch gets the same bits whatever rows are beside it, so that a batch of formations and a
-single one drive the same run. A matrix product of BLAS does not promise that: it takes another path for
-another number of rows. Here every sum is taken in one order, in float64, and rounded to float32 once
-per layer; actions differ from those of SB3, float32 throughout, by less than 1e-6.
+The result for a row of a batch has the same bits in every batch, so a formation drives the same run alone
+and in a batch. A matrix product of BLAS does not guarantee that: its order of summation depends on the
+number of rows. Here every sum has one order, in float64, and is rounded to float32 once per layer. The
+actions differ by less than 1e-6 from those of SB3, which computes in float32.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ from typing import Any
 import numpy as np
 
 from baselines.policies.card import WEIGHTS, Loaded, read_policy
+from baselines.policies.columns import Columns
 from tlf_env.numerics.compiled import block, driver, law
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.scenario import Scenario
@@ -24,28 +25,31 @@ LINEAR, TANH, RELU = range(3)
 ACTIVATIONS = {"tanh": TANH, "relu": RELU}
 LOG_STD_LIMITS = (-20.0, 2.0)  # SAC's
 
-LstmState = tuple[np.ndarray, np.ndarray]  # h and c, each (1, row, unit), as sb3-contrib has them
+LstmState = tuple[np.ndarray, np.ndarray]  # h and c, each (1, row, unit), as in sb3-contrib
 
 
 def shipped_policies() -> list[str]:
-    """Names of the policies that come with the package."""
+    """Names of the policies that are shipped with the package."""
     return sorted(path.stem for path in SHIPPED.glob(f"*{WEIGHTS}"))
 
 
 def load_policy(path_or_name: str | Path, *, seed: int = 0) -> LearnedPolicy:
     """A learned policy from ``NAME.safetensors`` and its card ``NAME.json``; runs without torch.
 
+    Its observation is the one with the card's previews, as ``scenario_overrides`` sets it. For another
+    observation, call :meth:`LearnedPolicy.bind` with the scenario.
+
     Parameters
     ----------
     path_or_name
         A path that ends in ``.safetensors``, or the name of a shipped policy.
     seed
-        Of the draws with ``deterministic=False``.
+        Seed of the draws with ``deterministic=False``.
 
     Raises
     ------
     ValueError
-        in one line, for an unknown name or what :func:`baselines.policies.card.read_policy` refuses.
+        in one line, for an unknown name, and as :func:`baselines.policies.card.read_policy` does.
     """
     text = str(path_or_name)
     if text.endswith(WEIGHTS):
@@ -62,18 +66,19 @@ class LearnedPolicy:
     Attributes
     ----------
     card : baselines.policies.card.Card
-        What it is and how it was made.
+        Its description.
     files : tuple of Path
         Its weights and its card.
     scenario_overrides : dict
-        Fields of a scenario that it needs, for ``load_scenario`` and ``parallel_env``. A part of
-        somebody's own (``module:factory``) is left out: a card must not choose code that is run.
+        Scenario fields that it needs, for ``load_scenario`` and ``parallel_env``. A custom part
+        (``module:factory``) is left out, because a card must not choose code that is run.
     """
 
     privileged = False
 
     def __init__(self, loaded: Loaded, *, seed: int = 0) -> None:
         self.card, tensors, self.files = loaded
+        self._columns: Columns | None = None  # of the observation; found at the first use
         network = self.card.network
         self._squashed = network.head == "squashed_gaussian"
         self._activation = ACTIVATIONS[network.activation]
@@ -112,15 +117,22 @@ class LearnedPolicy:
             if value is not None and not (isinstance(value, str) and ":" in value)
         }
 
-    def check_fit(self, name: str, scenario: Scenario) -> None:
-        """Check that a scenario is what the policy was trained for.
+    def overrides_for(self, scenario: Scenario) -> dict[str, Any]:
+        """The scenario fields that it needs, without its previews if the scenario has them already."""
+        needed = dict(self.scenario_overrides)
+        if set(self.card.preview_s) <= set(scenario.preview_s):
+            needed.pop("preview_s", None)
+        return needed
+
+    def bind(self, name: str, scenario: Scenario) -> None:
+        """Take the columns of a scenario's observation from now on.
 
         Raises
         ------
         ValueError
-            as :meth:`baselines.policies.card.Card.check_fit` does.
+            as :meth:`baselines.policies.card.Card.fit` does.
         """
-        self.card.check_fit(name, scenario)
+        self._columns = self.card.fit(name, scenario)
 
     def predict(
         self,
@@ -134,12 +146,13 @@ class LearnedPolicy:
         Parameters
         ----------
         state
-            With an LSTM: what the last call returned, None at the start. Otherwise handed through.
+            With an LSTM: the state that the last call returned, None at the start. Otherwise passed
+            through.
         episode_start
-            With an LSTM: rows ``(row,)`` whose state is forgotten first. None: no row.
+            With an LSTM: True for the rows ``(row,)`` whose state is reset first. None: no row.
         deterministic
-            False draws from the policy's Gaussian. The draws come from one generator, seeded when
-            the policy was loaded: a policy loaded anew and called alike draws alike.
+            False draws from the policy's Gaussian. The draws come from one generator, seeded when the
+            policy was loaded, so the same calls after a new load give the same draws.
 
         Returns
         -------
@@ -150,15 +163,17 @@ class LearnedPolicy:
         Raises
         ------
         ValueError
-            if the observation or the state is of another shape.
+            if the observation or the state has another shape.
         """
+        if self._columns is None:
+            self._columns = self.card.own_columns()
         observation = np.asarray(observation)
-        if observation.ndim not in (1, 2) or observation.shape[-1] != len(self.card.entries):
+        if observation.ndim not in (1, 2) or observation.shape[-1] != self._columns.width:
             raise ValueError(
                 f"the observation has the shape {observation.shape}; this policy takes "
-                f"{self.card.observation} observations of {len(self.card.entries)} entries"
+                f"{self.card.observation} observations of {self._columns.width} entries"
             )
-        rows = self._normalised(np.atleast_2d(observation))
+        rows = self._normalised(self._columns.take(np.atleast_2d(observation)))
         if self._lstm is not None:
             state = self._remembered(rows, state, episode_start)
             rows = state[0][0]
@@ -168,7 +183,7 @@ class LearnedPolicy:
         return (action[0] if observation.ndim == 1 else action), state
 
     def _normalised(self, rows: np.ndarray) -> np.ndarray:
-        """VecNormalize's, in float64 as it has it, then float32."""
+        """Normalised as by VecNormalize, in float64, then float32."""
         if self._normalisation is not None:
             mean, var, epsilon, clip = self._normalisation
             rows = np.clip((rows - mean) / np.sqrt(var + epsilon), -clip, clip)
@@ -177,7 +192,7 @@ class LearnedPolicy:
     def _remembered(
         self, rows: np.ndarray, state: LstmState | None, episode_start: np.ndarray | None
     ) -> LstmState:
-        """The LSTM's next state; the given one stays as it is."""
+        """The LSTM's next state; the given state is not changed."""
         assert self._lstm is not None
         shape = (1, len(rows), len(self._lstm[1]))
         if state is None:
@@ -209,7 +224,7 @@ class LearnedPolicy:
 
 
 def _transposed(weight: np.ndarray) -> np.ndarray:
-    """(in, out) from (out, in): the inner loop then runs over sums that do not depend on each other."""
+    """(in, out) from (out, in), so that the inner loop runs over independent sums."""
     return np.array(weight.T, order="C")
 
 
@@ -231,7 +246,7 @@ def _sigmoid(x: float) -> float:
 
 @block
 def _add_product(row: np.ndarray, weight: np.ndarray, sums: np.ndarray) -> None:
-    """Add ``row @ weight`` to float64 sums, entry after entry."""
+    """Add ``row @ weight`` to float64 sums, entry by entry."""
     for i in range(weight.shape[0]):
         value = np.float64(row[i])
         for j in range(weight.shape[1]):

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from baselines.policies.columns import find_columns
 from tlf_env.common.presets import is_file_name
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.controllers import load_controller
@@ -38,18 +39,18 @@ class ReferencePolicy:
         and limits on the twist), the path of a controller file (``.yaml``), :class:`TrackingGains` or
         :class:`Controller`.
     control_period_s
-        Period at which it acts, s: limits on accelerations need it.
+        Control period, s; needed for the limits on accelerations.
     preview_s
-        The scenario's previews, s: a lead is made from the first.
+        The scenario's previews, s; a lead is computed from the first.
 
     Raises
     ------
     ValueError
-        for an unknown preset, a file that is none, and a lead without a first preview above 0.
+        for an unknown preset, an invalid file, and a lead without a first preview above 0.
     """
 
     privileged = False
-    # An estimate of the slip, if it is to be cancelled, and what a controller file asks for.
+    # The estimator of a controller that cancels slip, and the fields that a controller file asks for.
     scenario_overrides: Mapping[str, Any] = {}
 
     def __init__(
@@ -68,9 +69,16 @@ class ReferencePolicy:
             self.controller = Controller(gains=gains)
         else:
             self.controller = gains
-        self._scales = np.array([entry.scale for entry in tracking_entries(preview_s).values()])
         self._row = controller_row(self.controller, control_period_s, preview_s)
-        self._needed = len(self._scales) if self.controller.lead_s else len(Tracking._fields)
+        # The law takes the fields of Tracking and, for a lead, the first preview, in this order.
+        names = list(Tracking._fields)
+        if self.controller.lead_s:
+            now = tracking_entries(())
+            names += [name for name in tracking_entries(preview_s[:1]) if name not in now]
+        entries = tracking_entries(preview_s)
+        self._columns = find_columns(names, entries)
+        self._needed = int(self._columns.places.max()) + 1
+        self._scales = np.array([entries[name].scale for name in names])
         if self.controller.limits.cancel_slip:
             asked = {"estimator": "ekf-slip"} | asked
         self.scenario_overrides = asked
@@ -84,7 +92,7 @@ class ReferencePolicy:
     ) -> tuple[np.ndarray, Any]:
         """Action for one ``tracking`` observation ``(entry,)`` or a batch ``(batch, entry)``.
 
-        Returns the action, in the observation's dtype and within [−1, 1], and ``state`` unchanged:
+        Returns the action, in the observation's dtype and within [−1, 1], and ``state`` unchanged, as
         the law has no memory.
 
         Raises
@@ -98,7 +106,10 @@ class ReferencePolicy:
                 f"the observation has the shape {observation.shape}; a tracking observation has at "
                 f"least {self._needed} entries, in one row or a batch of rows"
             )
-        rows = np.ascontiguousarray(np.atleast_2d(observation))
+        rows = np.atleast_2d(observation)
+        if not self._columns.leading:
+            rows = self._columns.take(rows)
+        rows = np.ascontiguousarray(rows)
         action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
         _actions(rows, self._scales, self._row, action)
         return (action[0] if observation.ndim == 1 else action), state

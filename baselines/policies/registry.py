@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import hashlib
+import inspect
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -21,8 +23,8 @@ from tlf_env.task.scenario import Scenario, load_scenario
 CLASSICAL = {"pure_pursuit": PurePursuit, "feedback_linearisation": FeedbackLinearisation}
 
 
-# What a policy may ask of a scenario: what it sees, what it acts on, and what runs on board. Nothing
-# that changes the task or the disturbance, which are the same for everybody.
+# Fields of the scenario that a policy may ask for: its observation, its action and the on-board parts.
+# The task and the disturbance are not among them: they are the same for all policies.
 OVERRIDABLE = (
     "action",
     "observation",
@@ -35,16 +37,16 @@ OVERRIDABLE = (
 )
 
 
-class Entry(NamedTuple):
-    """A policy, and the scenario as it needs it."""
+class FittedPolicy(NamedTuple):
+    """A policy, and the scenario with the fields that the policy asks for."""
 
     policy: Policy
     scenario: Scenario
-    overrides: dict[str, Any]  # fields that differ from the scenario given, as JSON has them
+    overrides: dict[str, Any]  # fields that differ from the given scenario, as JSON values
 
 
 def policy_names() -> list[str]:
-    """The names of the policies that are not learned; they need no file."""
+    """Names of the policies that are not learned; they need no file."""
     return [*(f"reference:{gains}" for gains in controller_names()), *CLASSICAL]
 
 
@@ -69,15 +71,16 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     """
     policy = _made(name, scenario, trust=trust)
     if isinstance(policy, LearnedPolicy):
-        policy.check_fit(name, scenario)
+        policy.bind(name, scenario)
     return policy
 
 
-def enter(name: str, scenario: Scenario, *, trust: bool = False) -> Entry:
-    """A policy, and the scenario with what the policy asks for in ``scenario_overrides``.
+def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedPolicy:
+    """A policy, and the scenario with the fields that the policy asks for.
 
-    That attribute maps fields of :data:`OVERRIDABLE` to values; a learned policy has it from its
-    card. A field that the scenario's file or the caller has set stands as it is set.
+    A policy asks by an attribute ``scenario_overrides``, which maps fields of :data:`OVERRIDABLE` to
+    values; a learned policy has it from its card. A field that the scenario's file or the caller has
+    set keeps its value.
 
     Parameters
     ----------
@@ -87,8 +90,8 @@ def enter(name: str, scenario: Scenario, *, trust: bool = False) -> Entry:
     Raises
     ------
     ValueError
-        as for :func:`make_policy`, and if a policy asks for a field that it may not, or a value that
-        there is not.
+        as for :func:`make_policy`, and if a policy asks for a field that it may not set, or for an
+        invalid value.
     """
     policy = _made(name, scenario, trust=trust)
     asked = _asked(name, policy, scenario)
@@ -105,33 +108,36 @@ def enter(name: str, scenario: Scenario, *, trust: bool = False) -> Entry:
         asked = {field: _plain(value) for field, value in differing.items()}
         scenario = fitted if asked else scenario
     if isinstance(policy, LearnedPolicy):
-        policy.check_fit(name, scenario)
-    return Entry(policy, scenario, asked)
+        policy.bind(name, scenario)
+    return FittedPolicy(policy, scenario, asked)
 
 
 def _plain(value: Any) -> Any:
-    """A scenario's field as JSON has it."""
+    """A scenario's field as a JSON value."""
     if isinstance(value, BaseModel):
         return value.model_dump()
     return list(value) if isinstance(value, tuple) else value
 
 
-def overrides_told(overrides: Mapping[str, Any]) -> list[str]:
-    """What a policy asks of the scenario, for people: a field and its value each."""
-    told = []
+def describe_overrides(overrides: Mapping[str, Any]) -> list[str]:
+    """The fields that a policy asks for, in words: one text for each field and its value."""
+    texts = []
     for field, value in overrides.items():
         if isinstance(value, Mapping):
-            told.append(f"{field} of its own")
+            texts.append(f"own {field}")
         elif isinstance(value, list):
-            told.append(f"{field} {', '.join(map(str, value))}")
+            texts.append(f"{field} {', '.join(map(str, value))}")
         else:
-            told.append(f"{field} {value}")
-    return told
+            texts.append(f"{field} {value}")
+    return texts
 
 
 def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
-    """What a policy asks for and nobody has set."""
-    asked = getattr(policy, "scenario_overrides", {})
+    """Fields that a policy asks for and that are not set yet."""
+    if isinstance(policy, LearnedPolicy):
+        asked: Any = policy.overrides_for(scenario)
+    else:
+        asked = getattr(policy, "scenario_overrides", {})
     if not isinstance(asked, Mapping) or set(asked) - set(OVERRIDABLE):
         raise ValueError(
             f"policy {name!r}: scenario_overrides must map fields of {', '.join(OVERRIDABLE)}; "
@@ -166,7 +172,7 @@ def fits(name: str, scenario: Scenario, *, action: str, observation: str) -> Non
     Raises
     ------
     ValueError
-        naming both.
+        naming both pairs.
     """
     if (scenario.action, scenario.observation) != (action, observation):
         raise ValueError(
@@ -175,10 +181,30 @@ def fits(name: str, scenario: Scenario, *, action: str, observation: str) -> Non
         )
 
 
+def policy_hash(name: str, policy: Policy) -> str | None:
+    """Twelve hexadecimal digits over the files that a policy is made from; None without files."""
+    files = [Path(name)] if name.endswith(".zip") else _source_files(policy)
+    if not files:
+        return None
+    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+
+
+def _source_files(policy: Policy) -> list[Path]:
+    """A learned policy's weights and card, or the file of the class and the controller file, if any."""
+    if isinstance(policy, LearnedPolicy):
+        return list(policy.files)
+    try:
+        source = inspect.getsourcefile(type(policy))
+    except TypeError:
+        return []
+    made_from = policy.files if isinstance(policy, ReferencePolicy) else ()
+    return [Path(source), *made_from] if source else []
+
+
 def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
     if not trust:
         raise ValueError(
-            f"{path}: loading an SB3 file runs code that is in it; --trust says that you want that"
+            f"{path}: loading an SB3 file runs code that it contains; allow that with --trust"
         )
     if not path.is_file():
         raise ValueError(f"cannot read {path}: no such file")

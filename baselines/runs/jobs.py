@@ -1,4 +1,4 @@
-"""What long commands share: a folder that holds one plan, and jobs spread over processes or machines."""
+"""What long commands share: a folder reserved for one plan, and jobs spread over processes or machines."""
 
 from __future__ import annotations
 
@@ -9,6 +9,8 @@ import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
+from functools import partial
+from itertools import islice
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, TypeVar
@@ -17,18 +19,18 @@ from tlf_env.common.files import atomic
 
 POLLED_EVERY_S = 0.5
 
-Shared = TypeVar("Shared")
-Job = TypeVar("Job")
-Answer = TypeVar("Answer")
+SharedT = TypeVar("SharedT")
+JobT = TypeVar("JobT")
+AnswerT = TypeVar("AnswerT")
 
 
 def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) -> None:
-    """Write what a folder is for, or check that it is for that already.
+    """Reserve a folder for a plan, or check that it is reserved for the same plan.
 
     Parameters
     ----------
     path
-        The JSON file that says so.
+        JSON file that holds the record.
     keys
         Entries of the record that must not change.
     what
@@ -47,48 +49,48 @@ def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) ->
     try:
         before = dict(json.loads(path.read_text(encoding="utf-8")))
     except (ValueError, TypeError) as error:
-        raise ValueError(f"{path} is damaged; take another --out, or remove it") from error
+        raise ValueError(f"{path} is damaged; choose another --out, or remove it") from error
     for key in keys:
         if before.get(key) != record[key]:
             raise ValueError(
-                f"{path.parent} holds {what} of another {key}; take another --out, or remove it"
+                f"{path.parent} holds {what} of another {key}; choose another --out, or remove it"
             )
 
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Keep other processes that ask for it out of a folder; a process that is killed keeps nobody out.
+    """Lock a folder against other processes that lock it too; a killed process leaves no lock behind.
 
     Raises
     ------
     ValueError
-        if one is there.
+        if another process holds the lock.
     """
     handle = os.open(folder, os.O_RDONLY)
     try:
         try:
             fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except BlockingIOError as error:
-            raise ValueError(f"another process is at work in {folder}") from error
+            raise ValueError(f"another process works in {folder}") from error
         yield
     finally:
         os.close(handle)
 
 
 def spread(
-    function: Callable[[Shared, Job], Answer],
-    shared: Shared,
-    jobs: Iterable[Job],
+    function: Callable[[SharedT, JobT], AnswerT],
+    shared: SharedT,
+    jobs: Iterable[JobT],
     *,
     processes: int = 1,
     ray_address: str | None = None,
     ahead: int = 1,
     meanwhile: Callable[[], None] = lambda: None,
-) -> Iterator[Answer]:
-    """Answers ``function(shared, job)`` as they come: here, in processes, or on a Ray cluster.
+) -> Iterator[AnswerT]:
+    """Answers ``function(shared, job)`` as they arrive: from here, from processes, or from a Ray cluster.
 
-    Jobs are drawn only when there is room for them, so that a generator may make the next one from
-    the answers so far, and an interrupt is quick.
+    A job is drawn only when a process is free for it. So a generator of jobs may use the answers so
+    far, and an interrupt is quick.
 
     Parameters
     ----------
@@ -112,25 +114,21 @@ def spread(
 
 
 def _in_processes(
-    function: Callable[[Shared, Job], Answer],
-    shared: Shared,
-    jobs: Iterable[Job],
+    function: Callable[[SharedT, JobT], AnswerT],
+    shared: SharedT,
+    jobs: Iterable[JobT],
     processes: int,
     ahead: int,
     meanwhile: Callable[[], None],
-) -> Iterator[Answer]:
-    waiting = iter(jobs)
+) -> Iterator[AnswerT]:
     pool = ProcessPoolExecutor(
         processes, mp_context=get_context("spawn"), initializer=_end_with_parent
     )
-    running: set[Future[Answer]] = set()
+    waiting = iter(jobs)
+    running: set[Future[AnswerT]] = set()
     try:
         while True:
-            while len(running) < processes * ahead:
-                try:
-                    job = next(waiting)
-                except StopIteration:
-                    break
+            for job in islice(waiting, processes * ahead - len(running)):
                 running.add(pool.submit(function, shared, job))
             if not running:
                 return
@@ -143,7 +141,7 @@ def _in_processes(
 
 
 def _end_with_parent() -> None:
-    """Let this worker end when its parent is killed, which a pool by itself does not."""
+    """End this worker when its parent is killed; a pool alone does not do that."""
     parent = parent_process()
 
     def wait_and_leave() -> None:
@@ -155,13 +153,13 @@ def _end_with_parent() -> None:
 
 
 def _on_ray(
-    function: Callable[[Shared, Job], Answer],
-    shared: Shared,
-    jobs: Iterable[Job],
+    function: Callable[[SharedT, JobT], AnswerT],
+    shared: SharedT,
+    jobs: Iterable[JobT],
     address: str,
     ahead: int,
     meanwhile: Callable[[], None],
-) -> Iterator[Answer]:
+) -> Iterator[AnswerT]:
     try:
         import ray
     except ModuleNotFoundError as error:
@@ -171,18 +169,12 @@ def _on_ray(
     except (ConnectionError, ValueError, RuntimeError) as error:
         raise ValueError(f"no Ray cluster at {address!r}: {error}") from error
     try:
-        remote = ray.remote(num_cpus=1)(function)
-        held = ray.put(shared)
+        submit = partial(ray.remote(num_cpus=1)(function).remote, ray.put(shared))
         limit = ahead * max(1, int(ray.cluster_resources().get("CPU", 1)))
         waiting = iter(jobs)
         running: list[Any] = []
         while True:
-            while len(running) < limit:
-                try:
-                    job = next(waiting)
-                except StopIteration:
-                    break
-                running.append(remote.remote(held, job))
+            running += [submit(job) for job in islice(waiting, limit - len(running))]
             if not running:
                 return
             done, running = ray.wait(running, timeout=POLLED_EVERY_S)

@@ -1,18 +1,13 @@
-"""One run of a policy on a scenario: recorded, measured, and written to a folder."""
+"""One run of a policy on a scenario, recorded and measured; several seeds side by side."""
 
 from __future__ import annotations
 
-import json
-import platform
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from importlib.metadata import PackageNotFoundError, version
-from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from tlf_env.common.files import atomic
 from tlf_env.engine import readout
 from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.batch import BatchPlant
@@ -23,8 +18,9 @@ from tlf_env.task.info import Info
 from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, string_metrics
 from tlf_env.task.scenario import Scenario
 
-REPORTED_PACKAGES = ("tlf-env", "numpy", "numba", "gymnasium", "pettingzoo", "pymunk")
+ItemT = TypeVar("ItemT")
 
+SEEDS_PER_BLOCK = 25  # runs side by side: a record takes 2 to 4 MB
 
 # Columns of a record, in the order of trajectory.csv; each is (time, robot).
 RECORDED = (
@@ -173,6 +169,12 @@ def run_seeds(
         yield tape.record(lane, scenario, seed, name)
 
 
+def seed_blocks(seeds: Sequence[ItemT]) -> Iterator[Sequence[ItemT]]:
+    """Blocks of up to 25 seeds (or of whatever has one), as many as run side by side."""
+    for i in range(0, len(seeds), SEEDS_PER_BLOCK):
+        yield seeds[i : i + SEEDS_PER_BLOCK]
+
+
 class _Driver:
     """A policy and what it remembers of an episode."""
 
@@ -241,57 +243,3 @@ def _with_functionals(rows: dict[str, np.ndarray], period_s: float) -> dict[str,
     rows["J_mm_s"] = np.cumsum(error, axis=0) * period_s
     rows["J_theta_rad_s"] = np.cumsum(-rows["heading_error_rad"], axis=0) * period_s
     return rows
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages that a result depends on."""
-    found = {"python": platform.python_version()}
-    for package in REPORTED_PACKAGES:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            found[package] = "unknown"
-    return found
-
-
-def summary(record: Record) -> dict[str, Any]:
-    """What ``summary.json`` holds."""
-    return {
-        "scenario": record.scenario.model_dump(mode="json"),
-        "seed": record.seed,
-        "policy": record.policy,
-        "privileged": record.scenario.privileged,
-        "settle_s": record.scenario.settle_s,
-        "versions": versions(),
-        "string": record.string()._asdict(),
-        "robots": {f"robot_{i}": metrics._asdict() for i, metrics in enumerate(record.metrics())},
-    }
-
-
-def write_record(record: Record, folder: Path) -> list[Path]:
-    """Write ``summary.json``, ``trajectory.npz`` and ``trajectory.csv``, each atomically."""
-    paths = [folder / name for name in ("summary.json", "trajectory.npz", "trajectory.csv")]
-    with atomic(paths[0], encoding="utf-8") as file:
-        json.dump(summary(record), file, indent=2, allow_nan=False)
-        file.write("\n")
-    with atomic(paths[1], "wb") as file:
-        columns: dict[str, Any] = dict(record.columns)
-        np.savez_compressed(file, t_s=record.t_s, leader_reference_mm=record.leader, **columns)
-    table = np.stack([record[name] for name in RECORDED], axis=-1).reshape(-1, len(RECORDED))
-    times = np.repeat(record.t_s, record.robots)
-    numbers = np.tile(np.arange(record.robots), len(record.t_s))
-    with atomic(paths[2], encoding="utf-8") as file:
-        file.write(",".join(("t_s", "robot", *RECORDED)) + "\n")
-        rows = np.column_stack([times, numbers, table])
-        np.savetxt(file, rows, fmt=["%.6g", "%d", *["%.9g"] * len(RECORDED)], delimiter=",")
-    return paths
-
-
-def write_mat(record: Record, folder: Path) -> Path:
-    """Write ``trajectory.mat`` (MATLAB 5 format): the columns of the run, ``(time, robot)``."""
-    from scipy.io import savemat
-
-    path = folder / "trajectory.mat"
-    with atomic(path, "wb") as file:
-        savemat(file, {"t_s": record.t_s, "leader_reference_mm": record.leader, **record.columns})
-    return path

@@ -1,12 +1,16 @@
-"""Where the time of a control step goes: the step's driver again, with a clock between its stages."""
+"""Time of each part of a control step: the step's driver again, with a clock between its stages."""
 
 from __future__ import annotations
 
+import statistics
 import time
+from typing import Any
 
 import numpy as np
 from numba import types
 
+from baselines.speed.environments import MIN_STEPS
+from baselines.speed.moments import Moments, VectorRun
 from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.batch import BatchPlant
 from tlf_env.engine.drivers import (
@@ -21,14 +25,15 @@ from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import driver
 
 processor_time_us = types.ExternalFunction("clock", types.int64())  # of the C library; POSIX: µs
+PARTS_FORMATIONS = 1024
 STAGES = ("actions", "substeps", "radio", "judging", "sensing")
 
 
 @driver
 def timed_step(a: Arrays, s: Settings, spent: np.ndarray) -> None:
-    """A control step of all lanes, none of them near; adds each stage's processor time, µs.
+    """A control step of all lanes, without contacts; adds each stage's processor time, µs.
 
-    The last of :data:`STAGES` runs the substeps' second half once more, with the robots where they are.
+    The last of :data:`STAGES` is measured by :func:`timed_sensing`.
     """
     lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
     near = np.empty(LANES_AT_ONCE, dtype=np.bool_)
@@ -55,7 +60,7 @@ def timed_step(a: Arrays, s: Settings, spent: np.ndarray) -> None:
 
 @driver
 def timed_sensing(a: Arrays, s: Settings, spent: np.ndarray) -> None:
-    """Sensors and estimators of a control step's substeps alone; the robots stay where they are."""
+    """Sensors and estimators of a control step's substeps alone; the robots do not move."""
     lanes = np.arange(a.clock.shape[0])
     for begin in range(0, lanes.shape[0], LANES_AT_ONCE):
         start = processor_time_us()
@@ -64,7 +69,7 @@ def timed_sensing(a: Arrays, s: Settings, spent: np.ndarray) -> None:
 
 
 def stage_times(plant: BatchPlant, steps: int) -> dict[str, float]:
-    """Processor time of each part of a formation's control step, µs. The plant is not fit for use after.
+    """Processor time of each part of a formation's control step, µs; leaves the plant unusable.
 
     ``plant`` is the wheel loops and the plant in all substeps, copying in and out included;
     ``onboard`` is encoders, position fixes and EKF.
@@ -76,7 +81,9 @@ def stage_times(plant: BatchPlant, steps: int) -> dict[str, float]:
     start = time.process_time()
     for _ in range(steps):
         timed_step(a, s, spent)
-    spent *= (time.process_time() - start) * 1e6 / spent.sum()  # clocks elsewhere tick otherwise
+    spent *= (
+        (time.process_time() - start) * 1e6 / spent.sum()
+    )  # the tick of clock() differs between systems
     timed_sensing(a, s, np.zeros(len(STAGES)))
     alone = np.zeros(len(STAGES))
     start = time.process_time()
@@ -91,3 +98,33 @@ def stage_times(plant: BatchPlant, steps: int) -> dict[str, float]:
         "radio": each[2],
         "observation_reward_info": each[3],
     }
+
+
+def part_times(robots: int, steps: int, repeats: int) -> dict[str, Any]:
+    """Parts of a formation's control step in a batch, µs of processor time on one thread, medians."""
+    formations = min(PARTS_FORMATIONS, max(1, steps))
+    run = VectorRun(Moments(robots, 100), formations)
+    plant, moments = run.env.plant, run.moments
+    count = 2 * MIN_STEPS
+    actions = [moments.actions_of(formations, k) for k in range(count)]
+    rows: list[dict[str, float]] = []
+    for _ in range(repeats):
+        moments.spread(plant)
+        start = time.process_time()
+        for action in actions:
+            plant.step(action)
+        bare = time.process_time() - start
+        learner = [action[:, min(1, robots - 1)].astype(np.float32) for action in actions]
+        moments.spread(plant)
+        start = time.process_time()
+        for action in learner:
+            run.env.step(action)
+        whole = time.process_time() - start
+        moments.spread(plant)
+        row = stage_times(plant, count)
+        row["api"] = max(whole - bare, 0.0) * 1e6 / (count * formations)
+        rows.append(row)
+    medians = {
+        name: round(float(statistics.median(row[name] for row in rows)), 3) for name in rows[0]
+    }
+    return {"robots": robots, "formations": formations, "us_per_formation_step": medians}

@@ -1,4 +1,4 @@
-"""A formation for VMAS, to be timed beside ours: unicycles that avoid each other, 10 substeps of 2 ms."""
+"""A formation for VMAS, timed as a peer: unicycles with collisions, 10 substeps of 2 ms."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ RADIUS_M, START_SPACING_M = 0.12, 0.6
 ACTIONS_KEPT = 8
 
 
-class Formation(BaseScenario):
-    """Robots in a line that are to stay one spacing behind each other; collisions on."""
+class VmasFormation(BaseScenario):
+    """Robots in a line, each to keep one spacing to the robot ahead; collisions on."""
 
     def make_world(self, batch_dim: int, device: torch.device, **kwargs: int) -> World:
-        """As many robots as ``robots`` says."""
+        """A world with ``robots`` robots."""
         self.plot_grid = False
         world = World(batch_dim, device, dt=CONTROL_PERIOD_S, substeps=SUBSTEPS)
         for i in range(kwargs["robots"]):
@@ -48,11 +48,11 @@ class Formation(BaseScenario):
         return self.world.agents[max(i - 1, 0)].state.pos - agent.state.pos
 
     def reward(self, agent: Agent) -> torch.Tensor:
-        """Minus how far the distance to the robot ahead is from the spacing."""
+        """Minus the deviation of the distance to the robot ahead from the spacing."""
         return -(torch.linalg.vector_norm(self._ahead(agent), dim=-1) - START_SPACING_M).abs()
 
     def observation(self, agent: Agent) -> torch.Tensor:
-        """Own pose and velocities, and where the robot ahead is."""
+        """Own pose and velocities, and the position of the robot ahead."""
         state = agent.state
         return torch.cat(
             [state.pos, state.rot, state.vel, state.ang_vel, self._ahead(agent)], dim=-1
@@ -60,9 +60,9 @@ class Formation(BaseScenario):
 
 
 def vmas_drive(robots: int, formations: int, threads: int) -> Callable[[int], float]:
-    """``drive(steps)``: seconds that so many steps of the formations take; actions are made before."""
+    """``drive(steps)``: time of so many steps of the formations, s; actions are drawn before."""
     env = make_env(
-        scenario=Formation(),
+        scenario=VmasFormation(),
         num_envs=formations,
         device="cpu",
         continuous_actions=True,

@@ -1,6 +1,6 @@
-"""The whole state of a training as one safetensors file, from which it goes on to the same result.
+"""The whole state of a training in one safetensors file; a resumed training ends with the same result.
 
-Nothing is pickled: a checkpoint holds numbers and JSON, and can be read without trust.
+Nothing is pickled: a checkpoint holds numbers and JSON, and reading it runs no code.
 """
 
 from __future__ import annotations
@@ -17,26 +17,26 @@ from safetensors.torch import save
 from baselines.sb3 import FormationVecEnv
 from tlf_env.common.files import atomic
 
-TENSOR = "tensor:"  # marks a name of a tensor in the tree of plain values
+TENSOR = "tensor:"  # marks a tensor's name in the tree of plain values
 BUFFERED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
-def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, told: dict[str, Any]) -> None:
-    """Write a model of SB3, its environments and all generators, whole or not at all.
+def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, notes: dict[str, Any]) -> None:
+    """Write a model of SB3, its environments and all random generators, atomically.
 
     Parameters
     ----------
     model
         PPO, SAC or RecurrentPPO between two calls of ``learn``.
-    told
-        Anything that JSON has; :func:`read_checkpoint` gives it back.
+    notes
+        Any JSON values; :func:`read_checkpoint` returns them.
     """
     tensors: dict[str, torch.Tensor] = {"torch_generator": torch.get_rng_state()}
-    # SB3 shuffles its samples with NumPy's global generator, so that one has to be kept and put back.
+    # SB3 shuffles its samples with NumPy's global generator, so its state must be kept, too.
     kind, keys, place, has_gauss, gauss = np.random.get_state()  # noqa: NPY002
     tensors["numpy_generator"] = torch.from_numpy(np.asarray(keys).copy())
     plain = {
-        "told": told,
+        "notes": notes,
         "steps": model.num_timesteps,
         "updates": model._n_updates,
         "numpy_generator": [kind, place, has_gauss, gauss],
@@ -54,16 +54,16 @@ def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, told: dict[s
 
 
 def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, Any]:
-    """Put a new model and new environments into the state of a checkpoint; returns what was told.
+    """Restore the state of a checkpoint in a new model and new environments; returns its notes.
 
     Raises
     ------
     ValueError
-        if the file is damaged, or is not of such a training.
+        if the file is damaged, or belongs to a training with other settings.
     """
     try:
         with safe_open(path, "pt") as file:
-            names = list(file.keys())  # what safetensors opens cannot be iterated itself
+            names = list(file.keys())  # safetensors' file cannot be iterated
             tensors = {name: file.get_tensor(name) for name in names}
             plain = json.loads(file.metadata()["state"])
         model.set_parameters(_with_tensors(plain["parameters"], tensors), exact_match=True)
@@ -78,21 +78,19 @@ def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, 
         model.action_space.np_random.bit_generator.state = plain["action_generator"]
         torch.set_rng_state(tensors["torch_generator"])
     except (SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise ValueError(
-            f"{path} cannot be gone on from: {' '.join(str(error).split())}"
-        ) from error
+        raise ValueError(f"cannot resume from {path}: {' '.join(str(error).split())}") from error
     model.num_timesteps, model._n_updates = plain["steps"], plain["updates"]
-    told: dict[str, Any] = plain["told"]
-    return told
+    notes: dict[str, Any] = plain["notes"]
+    return notes
 
 
 def _memory(model: Any) -> dict[str, Any]:
-    """What a model keeps from one call of ``learn`` to the next, beside its parameters."""
+    """State of a model between two calls of ``learn``, in addition to its parameters."""
     kept: dict[str, Any] = {
         "last_observations": torch.from_numpy(model._last_obs),
         "starts": torch.from_numpy(np.asarray(model._last_episode_starts)),
     }
-    for name in model._get_torch_save_params()[1]:  # SAC's temperature, no part of the parameters
+    for name in model._get_torch_save_params()[1]:  # SAC's temperature is not among the parameters
         kept[name] = getattr(model, name)
     states = getattr(model, "_last_lstm_states", None)
     if states is not None:
@@ -109,7 +107,7 @@ def _remember(model: Any, kept: dict[str, Any]) -> None:
     model._last_obs = kept["last_observations"].numpy()
     model._last_episode_starts = kept["starts"].numpy()
     for name in model._get_torch_save_params()[1]:
-        getattr(model, name).data.copy_(kept[name])  # in place: its optimizer holds it
+        getattr(model, name).data.copy_(kept[name])  # in place: the optimizer refers to it
     if "lstm" in kept:
         policy, critic = (tuple(pair) for pair in kept["lstm"])
         model._last_lstm_states = type(model._last_lstm_states)(policy, critic)
@@ -122,11 +120,11 @@ def _remember(model: Any, kept: dict[str, Any]) -> None:
 
 
 def _without_tensors(tree: Any, place: str, tensors: dict[str, torch.Tensor]) -> Any:
-    """The tree as JSON has it, its tensors put aside under the names of their places."""
+    """The tree as JSON values; its tensors are moved to ``tensors``, named by their places."""
     if isinstance(tree, torch.Tensor):
         tensors[place] = tree
         return TENSOR + place
-    if isinstance(tree, dict):  # a list of pairs: an optimizer's keys are numbers
+    if isinstance(tree, dict):  # a list of pairs: the keys of an optimizer's state are numbers
         pairs = [[k, _without_tensors(v, f"{place}.{k}", tensors)] for k, v in tree.items()]
         return {"pairs": pairs}
     if isinstance(tree, list | tuple):

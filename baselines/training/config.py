@@ -1,4 +1,4 @@
-"""What ``tlf train`` is told: one frozen, validated model, read from YAML."""
+"""Configuration of ``tlf train``: one frozen, validated model, read from YAML."""
 
 from __future__ import annotations
 
@@ -8,100 +8,101 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, FiniteFloat, ValidationError, model_validator
 
+from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.common.presets import read_preset_or_file
 from tlf_env.task.scenario import Scenario, load_scenario
 
-# Seeds of the benchmark's tables start at 20000: neither training nor choosing may see them.
-TRAINING_SEEDS = (0, 10_000)
-CHOOSING_SEEDS = (10_000, 20_000)
-
 Count = Annotated[int, Field(ge=1)]
-Seeds = tuple[Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]]  # first, and end (not run)
+SeedsFromTo = tuple[
+    Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]
+]  # first, end (not run)
 
 
 class NetworkConfig(Frozen):
-    """The policy's network, and as large a one for the critic."""
+    """The policy's network; the critic's has the same size."""
 
     hidden: Annotated[tuple[Count, ...], Field(max_length=4)] = (64, 64)
     activation: Literal["tanh", "relu"] = "tanh"
     lstm: Count | None = None  # size of the LSTM's state; RecurrentPPO only
     initial_log_std: FiniteFloat = -1.6
-    action_gain: Positive = 0.1  # factor on the first weights of the action: begin near 0
+    action_gain: Positive = 0.1  # factor on the initial weights of the action: begin near 0
 
 
 class ImitationConfig(Frozen):
-    """Doing first what the reference does; PPO with twists from ``tracking`` only."""
+    """Imitation of the reference before the training; PPO with twists from ``tracking`` only."""
 
     controller: str = "tuned"  # gains of the reference, without its limits on accelerations
-    robot_steps: Count = 600_000  # in all rounds
-    rounds: Count = 1  # in the first the reference drives, in the others the network
-    noise: NonNegative = 0.02  # on its actions, standard deviation
+    robot_steps: Count = 600_000  # over all rounds
+    rounds: Count = 1  # the reference drives in the first round, the network in the others
+    noise: NonNegative = 0.02  # on the actions, standard deviation
     epochs: Count = 10
     learning_rate: Positive = 1e-3
 
 
 class EvaluationConfig(Frozen):
-    """Judging on seeds held apart: which of the policies on the way is kept."""
+    """Evaluation on choosing seeds, which decides which policy is kept."""
 
     every: Count  # robot steps
-    seeds: Seeds = (10_000, 10_016)
+    seeds: SeedsFromTo = (10_000, 10_016)
     disturbances: Annotated[tuple[str, ...], Field(min_length=1)]
     horizon_s: Positive = 60.0
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        check_seeds("evaluation seeds", self.seeds, CHOOSING_SEEDS, "choose")
+        check_seeds("evaluation seeds", self.seeds, CHOOSING_SEEDS)
         return self
 
 
 class TrainConfig(Frozen):
-    """A training: who learns what, on which episodes, and how it is judged. Times in s."""
+    """A training: the algorithm, the episodes and the evaluation. Times in s."""
 
     algorithm: Literal["PPO", "SAC", "RecurrentPPO"]
-    settings: dict[str, Any] = {}  # the algorithm's own keyword arguments, in its own names
+    settings: dict[str, Any] = {}  # keyword arguments of SB3's algorithm
     final_learning_rate_share: Annotated[FiniteFloat, Field(gt=0, le=1)] = 1.0  # falls linearly
     network: NetworkConfig = NetworkConfig()
     imitation: ImitationConfig | None = None
-    robot_steps: Count  # control steps times robots, over all formations
+    robot_steps: Count  # control steps × robots, over all formations
     formations: Count = 96
-    seeds: Seeds = TRAINING_SEEDS  # of the episodes
-    scenario: dict[str, Any] = {}  # fields of every task
-    tasks: Annotated[dict[str, dict[str, Any]], Field(min_length=1)]  # and of each
+    seeds: SeedsFromTo = TRAINING_SEEDS  # of the episodes
+    scenario: dict[str, Any] = {}  # scenario fields of every task
+    tasks: Annotated[
+        dict[str, dict[str, Any]], Field(min_length=1)
+    ]  # task: its own scenario fields
     disturbances: Annotated[
         dict[str, NonNegative], Field(min_length=1)
     ]  # preset: share of episodes
-    levels: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)  # drawn alike
+    levels: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)  # with equal shares
     checkpoint_every: Count = 1_000_000  # robot steps
     evaluation: EvaluationConfig
 
     @model_validator(mode="after")
     def _check(self) -> Self:
-        check_seeds("seeds", self.seeds, TRAINING_SEEDS, "train")
+        check_seeds("seeds", self.seeds, TRAINING_SEEDS)
         if (self.network.lstm is not None) != (self.algorithm == "RecurrentPPO"):
             raise ValueError(
-                f"network.lstm is for RecurrentPPO and needed there; got {self.network.lstm} "
+                f"RecurrentPPO, and no other algorithm, needs network.lstm; got {self.network.lstm} "
                 f"with {self.algorithm}"
             )
         if self.imitation is not None and self.algorithm != "PPO":
-            raise ValueError(f"imitation is for PPO, not for {self.algorithm}")
+            raise ValueError(f"imitation needs algorithm PPO, got {self.algorithm}")
         if not any(self.disturbances.values()):
             raise ValueError("disturbances: at least one share must be above 0")
         for reserved in ("seed", "policy", "env", "policy_kwargs", "tensorboard_log", "use_sde"):
             if reserved in self.settings:
-                raise ValueError(f"settings.{reserved} is set elsewhere and cannot be given")
+                raise ValueError(f"settings.{reserved} is set by the training and must be left out")
         self.mixture()
         self.evaluation_scenarios()
         return self
 
     def mixture(self) -> tuple[dict[str, list[Scenario]], list[float]]:
-        """Scenarios of each task, a disturbance and level after the other, and their shares.
+        """Scenarios of each task (every disturbance at every level), and their shares of episodes.
 
         Raises
         ------
         ValueError
-            for a scenario that there is not or that cannot run in a batch.
+            for an invalid scenario, or one that cannot run in a batch.
         """
         wanted = {name: share for name, share in self.disturbances.items() if share > 0}
         shares = [share for share in wanted.values() for _ in self.levels]
@@ -116,7 +117,7 @@ class TrainConfig(Frozen):
         return tasks, shares
 
     def evaluation_scenarios(self) -> dict[tuple[str, str], Scenario]:
-        """Scenario of each task and disturbance that the policy is judged on."""
+        """Scenario of each task and disturbance of the evaluation."""
         return {
             (task, name): self._scenario(
                 task, **{**fields, "horizon_s": self.evaluation.horizon_s, "disturbance": name}
@@ -127,22 +128,6 @@ class TrainConfig(Frozen):
 
     def _scenario(self, task: str, **fields: Any) -> Scenario:
         return load_scenario(task, **{**self.scenario, "plant": "batch", **fields})
-
-
-def check_seeds(what: str, seeds: Seeds, allowed: Seeds, use: str) -> None:
-    """Check a range of seeds, FIRST to before END.
-
-    Raises
-    ------
-    ValueError
-        for an empty range, or one with seeds that are kept for something else.
-    """
-    first, end = seeds
-    if not allowed[0] <= first < end <= allowed[1]:
-        raise ValueError(
-            f"{what} {first}:{end} must be a range within {allowed[0]}:{allowed[1]}: those "
-            f"{use}, and the tables' seeds begin at {CHOOSING_SEEDS[1]}"
-        )
 
 
 def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> TrainConfig:

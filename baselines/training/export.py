@@ -1,18 +1,18 @@
-"""From a model of stable-baselines3 to a policy that runs without it. Only this needs torch."""
+"""Export of a stable-baselines3 model as a policy that runs without it. Only the export needs torch."""
 
 from __future__ import annotations
 
 import tempfile
 from collections.abc import Iterable, Mapping
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from baselines.policies.card import WEIGHTS, Card, Network, write_policy
+from baselines.policies.card import WEIGHTS, Card, write_policy
 from baselines.policies.learned import load_policy
-from baselines.runs.run import versions
+from baselines.policies.network import Network
+from baselines.runs.provenance import installed_versions, versions
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import OBSERVATION_LIMIT
@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 TRAINERS = ("torch", "stable-baselines3", "sb3-contrib")
 ALGORITHMS = ("PPO", "SAC", "RecurrentPPO")
-AGREEMENT = 1e-5  # of an action, before and after
+AGREEMENT = 1e-5  # largest difference between an action of the model and of its copy
 CHECKED_ROWS, CHECKED_STEPS = 32, 4
 
 
@@ -37,34 +37,34 @@ def export_policy(
     scores: Mapping[str, Any] | None = None,
     command: str = "",
 ) -> Card:
-    """Write a trained model as ``NAME.safetensors`` and ``NAME.json``, whole or not at all.
+    """Write a trained model as ``NAME.safetensors`` and ``NAME.json``, atomically.
 
-    Before anything is written, the policy is read back and its actions are compared with the model's
-    on random observations: a model that this does not know in every detail is refused, not bent.
+    Before anything is written to ``path``, a copy is loaded and its actions are compared with the model's
+    on random observations. A model with parts that the export does not support is refused.
 
     Parameters
     ----------
     model
         SB3's PPO or SAC or sb3-contrib's RecurrentPPO with an ``MlpPolicy`` (``MlpLstmPolicy``, one
-        layer): tanh or ReLU, no gSDE, actions in [−1, 1]². Where it was trained in a
-        ``VecNormalize`` that normalises observations, the statistics go along.
+        layer): tanh or ReLU, no gSDE, actions in [−1, 1]². The statistics of a ``VecNormalize`` that
+        normalises observations are exported, too.
     path
         Ends in ``.safetensors``.
     scenario
-        What it was trained on.
+        The scenario of the training.
     training
-        Settings of the algorithm, environment steps, wall time: for the card, anything that JSON has.
+        Settings of the algorithm, environment steps, wall time: any JSON values, for the card.
     seeds
-        What was seeded, and with what: ``{"learner": [0], "episodes": range(64)}``.
+        The seeds of everything that was seeded: ``{"learner": [0], "episodes": range(64)}``.
     scores
-        What it reached, for the card.
+        The scores that the policy reached, for the card.
     command
         The command that made it.
 
     Raises
     ------
     ValueError
-        for a model of another kind, or one that does not fit the scenario.
+        for an unsupported model, or one that does not fit the scenario.
     """
     path = Path(path)
     if path.suffix != WEIGHTS:
@@ -73,23 +73,23 @@ def export_policy(
     if algorithm not in ALGORITHMS:
         raise ValueError(f"a {algorithm} model cannot be exported; {', '.join(ALGORITHMS)} can")
     network, tensors = _network_of(model)
-    told: dict[str, Any] = {
+    card: dict[str, Any] = {
         "algorithm": algorithm,
         "training": training,
         "seeds": {name: tuple(values) for name, values in seeds.items()},
-        "versions": versions() | _trainers(),
+        "versions": versions() | installed_versions(TRAINERS),
         "scores": scores or {},
         "command": command,
     }
     with tempfile.TemporaryDirectory() as folder:
         trial = Path(folder) / path.name
-        write_policy(trial, network, tensors, scenario, **told)
+        write_policy(trial, network, tensors, scenario, **card)
         _check_agreement(model, load_policy(trial))
-    return write_policy(path, network, tensors, scenario, **told)
+    return write_policy(path, network, tensors, scenario, **card)
 
 
 def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
-    """What is computed, and with what."""
+    """The network of a model, and its tensors by name."""
     box = model.action_space
     if box.shape != (ACTION_SIZE,) or (box.low != -1).any() or (box.high != 1).any():
         raise ValueError(f"the model's actions must be a Box of [−1, 1]², got {box}")
@@ -106,7 +106,7 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
     if lstm is not None:
         if lstm.num_layers != 1:
             raise ValueError(
-                f"an LSTM of {lstm.num_layers} layers cannot be exported, one of 1 can"
+                f"an LSTM of {lstm.num_layers} layers cannot be exported; 1 layer is supported"
             )
         for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
             tensors[f"lstm.{name}"] = _array(getattr(lstm, f"{name}_l0"))
@@ -148,7 +148,13 @@ def _array(tensor: Any) -> np.ndarray:
 
 
 def _check_agreement(model: BaseAlgorithm, policy: Policy) -> None:
-    """Compare the actions of a few steps, rows starting anew on the way."""
+    """Compare the actions of a few steps; some rows start a new episode in between.
+
+    Raises
+    ------
+    ValueError
+        if they differ by more than :data:`AGREEMENT`.
+    """
     normaliser = model.get_vec_normalize_env()
     generator = np.random.default_rng(0)
     shape = (CHECKED_ROWS, *model.observation_space.shape)
@@ -163,15 +169,5 @@ def _check_agreement(model: BaseAlgorithm, policy: Policy) -> None:
         apart = float(np.abs(action - wanted).max())
         if not apart <= AGREEMENT:
             raise ValueError(
-                f"the model cannot be exported: its actions and those of its copy are {apart:.2g} apart"
+                f"the model cannot be exported: actions of its copy differ from its own by {apart:.2g}"
             )
-
-
-def _trainers() -> dict[str, str]:
-    found = {}
-    for package in TRAINERS:
-        try:
-            found[package] = version(package)
-        except PackageNotFoundError:
-            continue
-    return found

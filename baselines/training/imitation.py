@@ -1,4 +1,4 @@
-"""A start for policies that act by themselves: do first what the reference does."""
+"""Imitation: a network without a base controller first learns to act like the reference."""
 
 from __future__ import annotations
 
@@ -17,22 +17,22 @@ BATCH = 2048
 
 
 class Rows(NamedTuple):
-    """A round, one row for each robot and step."""
+    """One round, a row for each robot and step."""
 
     seen: np.ndarray  # observations
-    meant: np.ndarray  # what the teacher would have done
+    meant: np.ndarray  # the teacher's actions for them
     returns: np.ndarray  # discounted rewards that followed
 
 
 def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
-    """Fit a model of PPO to the reference that ``config.imitation`` names, and its critic to what that earns.
+    """Fit a PPO model to the reference that ``config.imitation`` names (the teacher), and its critic, too.
 
-    The teacher drives all formations, disturbed a little so that its way back is seen too; the network
-    is fitted to what the teacher would have done, and the critic to the discounted rewards that followed.
-    In further rounds the network drives, and the teacher only tells what it would have done: so the network
-    learns the way back from where its own errors lead (DAgger: Ross, Gordon, Bagnell, AISTATS 2011).
-    Limits on accelerations are taken off the teacher: with them its command is the last one and a small
-    step, and a network that imitates this drifts away.
+    In the first round the teacher drives all formations, with noise on its actions so that the data
+    contain its corrections. The network is fitted to the teacher's actions, and the critic to the
+    discounted rewards that followed. In further rounds the network drives, and the teacher's actions are
+    computed for what the network observes; so the network learns to correct its own errors (DAgger: Ross,
+    Gordon, Bagnell, AISTATS 2011). The teacher has no limits on accelerations: with them its command is
+    the last command plus a small step, and a network that imitates this drifts away.
 
     Raises
     ------
@@ -66,7 +66,7 @@ def _drive(
     wanted: ImitationConfig,
     generator: np.random.Generator,
 ) -> Rows:
-    """What was seen while ``driver`` drove, what the teacher would have done, and what came of it."""
+    """Observations while ``driver`` drives, the teacher's actions for them, and the returns."""
     steps = -(-wanted.robot_steps // (envs.num_envs * wanted.rounds))
     shape = (steps, envs.num_envs)
     seen = np.empty((*shape, *model.observation_space.shape), dtype=np.float32)
@@ -84,7 +84,7 @@ def _drive(
     model._last_obs = observations
     model._last_episode_starts = np.asarray(dones[-1])
     returns = np.empty_like(rewards)
-    last = rewards[-steps // 4 :].mean() / (1.0 - model.gamma)  # as if it went on like that
+    last = rewards[-steps // 4 :].mean() / (1.0 - model.gamma)  # as if the rewards stayed the same
     following = np.full(envs.num_envs, last, dtype=np.float32)
     for k in reversed(range(steps)):
         following = rewards[k] + model.gamma * np.where(dones[k], 0.0, following)

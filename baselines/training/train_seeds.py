@@ -10,14 +10,15 @@ from typing import Any, NamedTuple
 from baselines.policies.card import CARD
 from baselines.runs.jobs import spread
 from baselines.training.config import TrainConfig
-from baselines.training.train import POLICY, check_folder, train
+from baselines.training.curve import kept_evaluation
+from baselines.training.train import POLICY_FILE, check_folder, train
 from tlf_env.common.files import atomic
 
-STEPS = "robot_steps"  # the file in which a training tells how far it is
+STEPS_FILE = "robot_steps"  # holds the robot steps that a training has done
 
 
-class Shared(NamedTuple):
-    """What all seeds have in common."""
+class SharedByAllSeeds(NamedTuple):
+    """Settings that the trainings of all seeds share."""
 
     config: TrainConfig
     folder: Path
@@ -40,9 +41,9 @@ def train_seeds(
     Parameters
     ----------
     processes
-        Seeds at a time on this machine; its cores are shared out among them.
+        Seeds at a time on this machine; they share its cores.
     progress
-        Called with the robot steps done, over all seeds, and those in all.
+        Called with the robot steps done over all seeds, and their total.
 
     Returns
     -------
@@ -52,51 +53,51 @@ def train_seeds(
     Raises
     ------
     ValueError
-        as :func:`baselines.training.train.train` does; without a Ray cluster at the address.
+        as :func:`baselines.training.train.train` does; if no Ray cluster is at the address.
     KeyboardInterrupt
         after an interrupt, once all trainings have written their checkpoints.
     """
     places = {seed: folder / f"seed_{seed}" for seed in seeds}
-    for seed, place in places.items():  # before any of them works for long
+    for seed, place in places.items():  # before any training starts
         check_folder(config, seed, place)
     total = config.robot_steps * len(places)
 
-    def tell() -> None:
+    def report() -> None:
         if progress is not None:
             progress(sum(_steps_done(place) for place in places.values()), total)
 
-    def train_and_tell(shared: Shared, seed: int) -> dict[str, Any]:
-        return _train_one(shared, seed, tell)
+    def train_and_report(shared: SharedByAllSeeds, seed: int) -> dict[str, Any]:
+        return _train_one(shared, seed, report)
 
     elsewhere = ray_address is not None or processes > 1
     threads = 1 if ray_address else max(1, (os.cpu_count() or 1) // processes)
     curves = {}
     for curve in spread(
-        _train_one if elsewhere else train_and_tell,
-        Shared(config, folder, command, threads),
+        _train_one if elsewhere else train_and_report,
+        SharedByAllSeeds(config, folder, command, threads),
         list(places),
         processes=processes,
         ray_address=ray_address,
-        meanwhile=tell,
+        meanwhile=report,
     ):
         curves[curve["seed"]] = curve
-    best = min(curves, key=lambda seed: kept(curves[seed])["score_mm"])
-    for name in (POLICY, str(Path(POLICY).with_suffix(CARD))):
+    best = min(curves, key=lambda seed: kept_evaluation(curves[seed])["score_mm"])
+    for name in (POLICY_FILE, str(Path(POLICY_FILE).with_suffix(CARD))):
         with atomic(folder / name, "wb") as file:
             file.write((places[best] / name).read_bytes())
     return [curves[seed] for seed in seeds]
 
 
 def _train_one(
-    shared: Shared, seed: int, tell: Callable[[], None] = lambda: None
+    shared: SharedByAllSeeds, seed: int, report: Callable[[], None] = lambda: None
 ) -> dict[str, Any]:
-    """One seed; how far it is stands in a file, so that another process or machine can tell."""
+    """One seed; its progress is kept in a file, which other processes and machines can read."""
     folder = shared.folder / f"seed_{seed}"
 
     def progress(done: int, total: int) -> None:
-        with atomic(folder / STEPS) as file:
+        with atomic(folder / STEPS_FILE) as file:
             file.write(f"{done}\n")
-        tell()
+        report()
 
     return train(
         shared.config,
@@ -110,11 +111,6 @@ def _train_one(
 
 def _steps_done(folder: Path) -> int:
     try:
-        return int((folder / STEPS).read_text(encoding="utf-8"))
+        return int((folder / STEPS_FILE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return 0
-
-
-def kept(curve: dict[str, Any]) -> dict[str, Any]:
-    """The evaluation of the policy that was kept."""
-    return min(curve["evaluations"], key=lambda one: one["score_mm"])

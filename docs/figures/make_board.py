@@ -14,9 +14,10 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from baselines.benchmark.aggregate import markdown, number
-from baselines.benchmark.bench import PLAN, RUNS, Cell, Plan
 from baselines.benchmark.figures import write_bench_figures
+from baselines.benchmark.page import markdown, number
+from baselines.benchmark.plan import Episode, Plan
+from baselines.benchmark.results import BOARD_FILE, PLAN_FILE, RUNS_FILE
 from tlf_env.common.files import atomic
 from tlf_env.task.scenario import load_scenario
 
@@ -40,24 +41,24 @@ def read_results(folder: Path) -> tuple[Board, list[Line]]:
         if a file or an episode is missing, or the leaderboard belongs to another plan.
     """
     hint = f"tlf bench --plan board --out {folder}"
-    for name in (PLAN, RUNS, "leaderboard.json"):
+    for name in (PLAN_FILE, RUNS_FILE, BOARD_FILE):
         if not (folder / name).is_file():
             raise ValueError(f"{folder} has no {name}; run: {hint}")
-    board = json.loads((folder / "leaderboard.json").read_text("utf-8"))
-    made = json.loads((folder / PLAN).read_text("utf-8"))
+    board = json.loads((folder / BOARD_FILE).read_text("utf-8"))
+    made = json.loads((folder / PLAN_FILE).read_text("utf-8"))
     if board["plan"] != made or "comparisons" not in board:
-        raise ValueError(f"{folder}/leaderboard.json does not belong to {PLAN}; run again: {hint}")
-    texts = (folder / RUNS).read_text("utf-8").splitlines()
-    lines = {Cell(*(line[name] for name in Cell._fields)): line for line in map(json.loads, texts)}
-    wanted = plan_of(board).cells()
-    missing = [cell for cell in wanted if cell not in lines]
+        raise ValueError(f"{folder}/{BOARD_FILE} does not belong to {PLAN_FILE}; run again: {hint}")
+    texts = (folder / RUNS_FILE).read_text("utf-8").splitlines()
+    lines = {Episode.of_line(line): line for line in map(json.loads, texts)}
+    wanted = plan_of(board).episodes()
+    missing = [episode for episode in wanted if episode not in lines]
     if missing:
         first = ", ".join(str(part) for part in missing[0] if part is not None)
         raise ValueError(
             f"{folder}: {len(missing)} of {len(wanted)} episodes are missing, the first is {first}; "
             f"run again: {hint}"
         )
-    return board, [lines[cell] for cell in wanted]
+    return board, [lines[episode] for episode in wanted]
 
 
 def plan_of(board: Board) -> Plan:
@@ -198,7 +199,7 @@ def write_board(results: Path, root: Path = ROOT) -> None:
     folder = root / "docs" / "leaderboard"
     folder.mkdir(parents=True, exist_ok=True)
     figures = [f"leaderboard/{path.name}" for path in write_bench_figures(board, folder)]
-    write_text(folder / "leaderboard.json", json.dumps(board, indent=1, allow_nan=False) + "\n")
+    write_text(folder / BOARD_FILE, json.dumps(board, indent=1, allow_nan=False) + "\n")
     write_text(
         folder / "slice.jsonl", "".join(json.dumps(line) + "\n" for line in slice_of(board, lines))
     )

@@ -12,13 +12,12 @@ import numpy as np
 from make_board import DOCS, with_part, write_text
 
 from baselines import ReferencePolicy
-from baselines.runs.run import run_seeds
+from baselines.runs.run import run_seeds, seed_blocks
 from tlf_env.onboard.tracking import TrackingGains
 from tlf_env.task.scenario import load_scenario
 
 HORIZON_S = 60.0
 SEEDS = range(20_000, 20_050)
-AT_ONCE = 25
 RATIOS = (2.0, 0.83)  # k₂/k₃, 1/s
 END, LOST_RMS_MM, FAR_MM = 0.7, 100.0, 1200.0
 BEGIN_PART, END_PART = "<!-- damping -->", "<!-- end of damping -->"
@@ -79,8 +78,8 @@ def measure(case: Case, ratio: float, estimator: str) -> Counts:
     policy = ReferencePolicy(TrackingGains(k_2_mm2_s=ratio * TrackingGains().k_3_mm2))
     first = round(END * scenario.horizon_steps)
     rows = []
-    for i in range(0, len(SEEDS), AT_ONCE):
-        for record in run_seeds(scenario, policy, SEEDS[i : i + AT_ONCE]):
+    for seeds in seed_blocks(SEEDS):
+        for record in run_seeds(scenario, policy, seeds):
             error_mm = record["position_error_mm"]
             rms_mm = np.sqrt(np.mean(error_mm[first:] ** 2, axis=0))
             rows.append((rms_mm.max(), error_mm.max()))

@@ -17,6 +17,7 @@ from make_figures import BLUE, FOLDER, GREEN, GREY, ORANGE, STYLE
 from make_speed import table
 from matplotlib.figure import Figure
 
+from baselines.training.curve import kept_evaluation
 from tlf_env.common.files import atomic
 
 DOCS = FOLDER.parent
@@ -59,18 +60,13 @@ def kept_curves() -> dict[str, list[Curve]]:
     return curves
 
 
-def best(curve: Curve) -> dict[str, Any]:
-    """The evaluation of the policy that was kept."""
-    return min(curve["evaluations"], key=lambda one: one["score_mm"])
-
-
 def trainings(curves: dict[str, list[Curve]]) -> str:
     """The table of trainings: one row per seed."""
     head = ["training", "seed", "score at the start", "kept", "failed", "at robot steps", "minutes"]
     rows = []
     for name, seeds in curves.items():
         for curve in seeds:
-            first, last = curve["evaluations"][0], best(curve)
+            first, last = curve["evaluations"][0], kept_evaluation(curve)
             runs = sum(cell["runs"] for cell in last["cells"].values())
             rows.append(
                 [

@@ -14,6 +14,7 @@ import numpy as np
 from make_board import DOCS, with_part, write_text
 
 from baselines import ReferencePolicy
+from baselines.runs.outcome import failed
 from baselines.runs.run import run_seeds
 from tlf_env.onboard.controllers import controller
 from tlf_env.task.scenario import load_scenario
@@ -69,7 +70,7 @@ def cell(policy: ReferencePolicy, disturbance: str, fields: dict[str, Any]) -> s
     )
     runs = [record.metrics() for record in run_seeds(scenario, policy, SEEDS)]
     rms_mm = np.median([max(robot.position_rmse_mm for robot in run) for run in runs])
-    lost = sum(any(robot.lost or robot.touched for robot in run) for run in runs)
+    lost = sum(map(failed, runs))
     return f"{rms_mm:.1f} ({lost})" if lost else f"{rms_mm:.1f}"
 
 

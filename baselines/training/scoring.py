@@ -1,4 +1,4 @@
-"""How a policy does on choosing seeds: one number for each task and disturbance, and one for all."""
+"""Score of a policy on choosing seeds: one number for each task and disturbance, and one for all."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from typing import NamedTuple
 
 import numpy as np
 
+from baselines.runs.outcome import failed
 from baselines.runs.run import run_seeds
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario
 
-FAILED_MM = 1000.0  # what a run counts for in which a robot is lost or touches another
+FAILED_MM = 1000.0  # position RMS that a failed run counts as
 SMALLEST_MM = 0.1
 MEASURED = ("position_rmse_mm", "error_capped_mean_mm", "torque_rms_Nmm")
 
 
-class Cell(NamedTuple):
+class ScenarioScore(NamedTuple):
     """One task under one disturbance, over the seeds: medians of the worst robot, and failures."""
 
     position_rmse_mm: float
@@ -28,33 +29,33 @@ class Cell(NamedTuple):
     score_mm: float  # geometric mean of the position RMS, FAILED_MM for a failed run
 
 
-def evaluate(
+def score_policy(
     policy: Policy, scenarios: Mapping[tuple[str, str], Scenario], seeds: range
-) -> dict[str, Cell]:
-    """Every task and disturbance, by ``"task, disturbance"``."""
+) -> dict[str, ScenarioScore]:
+    """Score of a policy for every task and disturbance, by ``"task, disturbance"``."""
     return {
-        f"{task}, {disturbance}": cell(policy, scenario, seeds)
+        f"{task}, {disturbance}": score_scenario(policy, scenario, seeds)
         for (task, disturbance), scenario in scenarios.items()
     }
 
 
-def overall_mm(cells: Mapping[str, Cell]) -> float:
-    """Geometric mean of all cells' scores, mm; less is better."""
-    return math.exp(float(np.mean([math.log(one.score_mm) for one in cells.values()])))
+def overall_mm(scores: Mapping[str, ScenarioScore]) -> float:
+    """Geometric mean of all scores, mm; less is better."""
+    return math.exp(float(np.mean([math.log(one.score_mm) for one in scores.values()])))
 
 
-def cell(policy: Policy, scenario: Scenario, seeds: range) -> Cell:
-    """One scenario over the seeds."""
-    worst, failed = [], []
+def score_scenario(policy: Policy, scenario: Scenario, seeds: range) -> ScenarioScore:
+    """Score of a policy in one scenario over the seeds."""
+    worst, fails = [], []
     for record in run_seeds(scenario, policy, seeds):
         robots = record.metrics()
         worst.append([max(getattr(robot, name) for robot in robots) for name in MEASURED])
-        failed.append(any(robot.lost or robot.touched for robot in robots))
+        fails.append(failed(robots))
     table = np.array(worst)
-    counted = np.where(failed, FAILED_MM, np.clip(table[:, 0], SMALLEST_MM, FAILED_MM))
-    return Cell(
+    counted = np.where(fails, FAILED_MM, np.clip(table[:, 0], SMALLEST_MM, FAILED_MM))
+    return ScenarioScore(
         **dict(zip(MEASURED, np.median(table, axis=0).tolist(), strict=True)),
-        failed=sum(failed),
-        runs=len(failed),
+        failed=sum(fails),
+        runs=len(fails),
         score_mm=float(np.exp(np.log(counted).mean())),
     )

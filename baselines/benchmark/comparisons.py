@@ -1,0 +1,89 @@
+"""Comparison of each entry with the best of the other policies, on the same seeds."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+
+from baselines.benchmark.lines import Line, Strata, failures, stratum_of, worst
+from baselines.benchmark.statistics import paired
+from baselines.policies.registry import policy_names
+
+COMPARED = {  # metric: how a policy is compared with its rival, both at the run's worst robot
+    "position_rmse_mm": "difference",
+    "error_capped_mean_mm": "difference",
+    "torque_rms_Nmm": "ratio",
+}
+
+
+def comparisons(groups: Mapping[str, Strata], ranked: Sequence[str]) -> list[dict[str, Any]]:
+    """Each entry against the best of the other policies, stratum by stratum, on the same seeds.
+
+    Entries are the policies that are not among the package's named ones, for example learned policies.
+    Without such a policy, the first of ``ranked`` is the entry. The rival in a stratum is the other
+    policy with the fewest failed runs, and among equals the one with the smallest median position RMS.
+    It is chosen by the same runs that are compared, which favours the rival. A privileged policy
+    cannot be the rival.
+
+    Raises
+    ------
+    ValueError
+        if an entry and its rival have not run the same seeds.
+    """
+    known = ("reference", *policy_names())
+    entries = [policy for policy in groups if policy not in known] or list(ranked[:1])
+    others = [
+        policy
+        for policy, strata in groups.items()
+        if policy not in entries
+        and not any(line["privileged"] for lines in strata.values() for line in lines)
+    ]
+    rows = []
+    for entry in entries:
+        for stratum, lines in groups[entry].items():
+            rivals = {name: groups[name][stratum] for name in others if stratum in groups[name]}
+            if rivals:
+                rival = min(rivals, key=lambda name: standing(rivals[name]))
+                rows.append(comparison(lines, rivals[rival]))
+    return rows
+
+
+def standing(lines: Sequence[Line]) -> tuple[int, float]:
+    """Rank of a policy in a stratum, less is better: failed runs, then the median position RMS."""
+    values = [worst(line, "position_rmse_mm") for line in lines]
+    defined = [value for value in values if value is not None]
+    return failures(lines), float(np.median(defined)) if defined else math.inf
+
+
+def comparison(mine: Sequence[Line], theirs: Sequence[Line]) -> dict[str, Any]:
+    """Difference between a policy and its rival in one stratum.
+
+    Raises
+    ------
+    ValueError
+        if they have not run the same seeds.
+    """
+    other = {line["seed"]: line for line in theirs}
+    if sorted(other) != sorted(line["seed"] for line in mine):
+        place = ", ".join(str(part) for part in stratum_of(mine[0]) if part is not None)
+        raise ValueError(
+            f"{mine[0]['policy']} and {theirs[0]['policy']} have not run the same seeds of {place}"
+        )
+    pairs = [(line, other[line["seed"]]) for line in mine]
+    task, disturbance, swept = stratum_of(mine[0])
+    return {
+        "policy": mine[0]["policy"],
+        "rival": theirs[0]["policy"],
+        "task": task,
+        "disturbance": disturbance,
+        "sweep": swept,
+        "runs": len(pairs),
+        "failed": [failures(mine), failures(theirs)],
+        **{
+            metric: paired([(worst(a, metric), worst(b, metric)) for a, b in pairs], how)
+            for metric, how in COMPARED.items()
+        },
+    }

@@ -1,0 +1,35 @@
+"""Values of the lines of ``runs.jsonl`` that the tables are made from."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from baselines.runs.outcome import failed
+
+Line = dict[str, Any]
+Stratum = tuple[str, str, float | None]  # task, disturbance, value of the swept knob
+Strata = dict[Stratum, list[Line]]  # runs of one policy
+
+
+def failures(lines: Sequence[Line]) -> int:
+    """How many of the runs failed."""
+    return sum(failed(line["robots"]) for line in lines)
+
+
+def worst(line: Line, metric: str) -> float | None:
+    """A run's value of a metric at its worst robot; None if undefined for all robots."""
+    values = [robot[metric] for robot in line["robots"] if robot[metric] is not None]
+    return max(values, default=None)
+
+
+def run_score(line: Line) -> float:
+    """A run's score: the mean over its robots, 0 to 100."""
+    return float(np.mean([robot["score"] for robot in line["robots"]]))
+
+
+def stratum_of(line: Line) -> Stratum:
+    """Task, disturbance and swept value of a line."""
+    return line["task"], line["disturbance"], line["sweep"]

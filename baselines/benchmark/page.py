@@ -1,0 +1,165 @@
+"""The leaderboard as a Markdown page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from baselines.policies.registry import describe_overrides
+
+
+def markdown(board: dict[str, Any], figures: Sequence[str] = ()) -> str:
+    """The tables as Markdown, with links to the figures."""
+    plan = board["plan"]["plan"]
+    first, end = plan["seeds"]
+    parts = [
+        "# Leaderboard\n",
+        f"Made by `{board['command']}`: seeds {first} to {end - 1}, the same draws for every policy. "
+        "Intervals are 95 %, by stratified bootstrap (shares: Wilson). A run fails if a robot is lost or "
+        "touches another. Definitions: `docs/metrics.md`, `docs/benchmark.md`.\n",
+        "## Over all tasks and disturbances\n",
+        "| policy | score (IQM) | interval | normalised | better than the reference | failed |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    parts += [
+        f"| {policy_label(row)} | {row['score']['iqm']:.1f} | {span(row['score']['interval'], 1)} | "
+        f"{number(row['normalised_score'], 2)} | {number(row['probability_of_improvement'], 2)} | "
+        f"{row['failed']} of {row['runs']} |"
+        for row in board["policies"]
+    ]
+    parts.append("")
+    parts += comparison_tables(board)
+    tasks = dict.fromkeys(cell["task"] for cell in board["cells"])
+    for task in tasks:
+        parts += task_tables(board, task)
+    if board["breaking_points"]:
+        parts += [
+            "## Where policies break\n",
+            f"Value of `{plan['sweep']}` at which a policy fails in 5 % and in 50 % of its runs.\n",
+            "| policy | task | disturbance | 5 % | 50 % |",
+            "|---|---|---|---:|---:|",
+        ]
+        parts += [
+            f"| {row['policy']} | {row['task']} | {row['disturbance']} | "
+            f"{number(row['loses_5_percent_at'], 3)} | {number(row['loses_50_percent_at'], 3)} |"
+            for row in board["breaking_points"]
+        ]
+        parts.append("")
+    if figures:
+        parts.append("## Figures\n")
+        parts += [f"![{figure_title(name)}]({name})\n" for name in figures]
+    return "\n".join(parts)
+
+
+def figure_title(name: str) -> str:
+    """A figure's title from its file name: ``leaderboard/scores.png`` → ``Scores``."""
+    return Path(name).stem.replace("_", " ").capitalize()
+
+
+def comparison_tables(board: dict[str, Any]) -> list[str]:
+    """Each entry against the best other policy: a sentence, and a row per task and disturbance."""
+    parts = []
+    for policy in dict.fromkeys(row["policy"] for row in board["comparisons"]):
+        rows = [row for row in board["comparisons"] if row["policy"] == policy]
+        parts += [
+            f"## {policy} against the best other policy\n",
+            "The rival in each row is the other policy with the fewest failed runs there; among equals, the "
+            "one with the smallest median position RMS. Differences of medians over seeds (entry minus "
+            "rival, worst robot; torque: ratio); intervals resample seeds, for both policies together. "
+            "**Bold**: significant difference (the interval excludes 0, or a ratio of 1).\n",
+            f"Position RMS: {verdict(rows)}.\n",
+            "| task | disturbance | rival | failed | rival failed | position RMS, difference mm | "
+            "capped mean, difference mm | torque RMS, ratio |",
+            "|---|---|---|---:|---:|---:|---:|---:|",
+        ]
+        parts += [
+            f"| {row['task']} | {stratum_name(row)} | {row['rival']} | {row['failed'][0]} of {row['runs']} | "
+            f"{row['failed'][1]} of {row['runs']} | {compared(row['position_rmse_mm'], 2)} | "
+            f"{compared(row['error_capped_mean_mm'], 2)} | {compared(row['torque_rms_Nmm'], 3)} |"
+            for row in rows
+        ]
+        parts.append("")
+    return parts
+
+
+def stratum_name(row: dict[str, Any]) -> str:
+    """A disturbance, with the value of a swept knob."""
+    return row["disturbance"] + ("" if row["sweep"] is None else f" = {row['sweep']:g}")
+
+
+def sign(found: dict[str, Any], equal: float) -> int:
+    """-1 or 1 if the interval lies below or above the value ``equal`` (no difference); else 0."""
+    ends = found["interval"]
+    if ends is None:
+        return 0
+    return int(ends[0] > equal) - int(ends[1] < equal)
+
+
+def verdict(rows: Sequence[dict[str, Any]]) -> str:
+    """In how many strata the position RMS is smaller, larger, or not significantly different."""
+    signs = [sign(row["position_rmse_mm"], 0.0) for row in rows]
+    return (
+        f"smaller in {signs.count(-1)} of {len(rows)} rows, larger in {signs.count(1)}, "
+        f"no significant difference in {signs.count(0)}"
+    )
+
+
+def compared(found: dict[str, Any], digits: int) -> str:
+    """A difference or a ratio with its interval, bold if the difference is significant."""
+    ratio = "ratio" in found
+    value = found["ratio" if ratio else "difference"]
+    text = number(value, digits)
+    if value is not None and value > 0 and not ratio:
+        text = f"+{text}"
+    if sign(found, 1.0 if ratio else 0.0):
+        text = f"**{text}**"
+    return f"{text} {span(found['interval'], digits)}".strip()
+
+
+def task_tables(board: dict[str, Any], task: str) -> list[str]:
+    """A table of one task: a row per disturbance and policy."""
+    parts = [
+        f"## {task}\n",
+        "RMS: worst robot from 40 % of the horizon on, median over seeds; capped: mean of "
+        "min(error, 500 mm) over the whole run.\n",
+        "| disturbance | policy | lost | touched | position RMS mm | formation RMS mm | capped mean mm | "
+        "torque RMS N·mm | score |",
+        "|---|---|---:|---:|---:|---:|---:|---:|---:|",
+    ]
+    for cell in board["cells"]:
+        if cell["task"] != task:
+            continue
+        figures = [
+            f"{number(cell[metric]['median'], digits)} {span(cell[metric]['interval'], digits)}"
+            for metric, digits in (
+                ("position_rmse_mm", 1),
+                ("settled_formation_rmse_mm", 1),
+                ("error_capped_mean_mm", 1),
+            )
+        ]
+        parts.append(
+            f"| {stratum_name(cell)} | {policy_label(cell)} | {cell['lost']['count']} of {cell['runs']} "
+            f"{span([100 * x for x in cell['lost']['interval']], 0)} % | {cell['touched']['count']} | "
+            f"{' | '.join(figures)} | {number(cell['torque_rms_Nmm']['median'], 1)} | "
+            f"{cell['score']['iqm']:.1f} {span(cell['score']['interval'], 1)} |"
+        )
+    return [*parts, ""]
+
+
+def policy_label(row: dict[str, Any]) -> str:
+    """A policy's name, with the scenario fields that it sets, and marked if privileged."""
+    marks = describe_overrides(row.get("overrides", {}))
+    marks += ["privileged"] if row["privileged"] else []
+    return row["policy"] + (f" ({'; '.join(marks)})" if marks else "")
+
+
+def span(ends: Sequence[float] | None, digits: int) -> str:
+    """An interval in brackets."""
+    return "" if ends is None else f"[{ends[0]:.{digits}f}, {ends[1]:.{digits}f}]"
+
+
+def number(value: float | None, digits: int) -> str:
+    """A number, or a dash."""
+    return "–" if value is None or not math.isfinite(value) else f"{value:.{digits}f}"

@@ -1,0 +1,114 @@
+"""The folder of a benchmark's results: ``plan.json``, and a line of ``runs.jsonl`` per episode."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from baselines.benchmark.plan import Episode, Plan
+from baselines.policies.registry import fit_policy, policy_hash
+from baselines.runs.jobs import claim
+from baselines.runs.provenance import git_revision, scenario_hash, versions
+from tlf_env.common.files import atomic
+from tlf_env.numerics.compiled import sources_digest
+from tlf_env.numerics.philox import checked_seed
+
+RUNS_FILE, PLAN_FILE, BOARD_FILE, PAGE_FILE = (
+    "runs.jsonl",
+    "plan.json",
+    "leaderboard.json",
+    "leaderboard.md",
+)
+
+
+def plan_record(plan: Plan) -> dict[str, Any]:
+    """The content of ``plan.json``. Every scenario is loaded and every policy is made.
+
+    Raises
+    ------
+    ValueError
+        for an unknown name, a knob outside its range, a seed too large, or a policy that does not fit.
+    """
+    checked_seed(plan.seeds[1] - 1)
+    scenarios: dict[str, str] = {}
+    policies: dict[str, str | None] = {}
+    for task in plan.tasks:
+        for disturbance in plan.disturbances:
+            for value in plan.values:
+                episode = Episode("", task, disturbance, plan.level, value, plan.seeds[0])
+                place = ", ".join(
+                    (task, disturbance) if value is None else (task, disturbance, f"{value:g}")
+                )
+                scenario = plan.scenario(episode)
+                scenarios[place] = scenario_hash(scenario)
+        for name in plan.policies:
+            policies[name] = policy_hash(name, fit_policy(name, scenario, trust=plan.trust).policy)
+    asked = asdict(plan)
+    del asked["trust"]  # a permission, which changes no result
+    return {
+        "plan": json.loads(json.dumps(asked)),
+        "policies": policies,
+        "scenarios": scenarios,
+        "sources": sources_digest(),
+        "versions": versions(),
+        "git_revision": git_revision(),
+    }
+
+
+class Results:
+    """The lines of finished episodes in a folder, and which episodes are missing.
+
+    Raises
+    ------
+    ValueError
+        if the plan cannot run, or the folder holds results of another plan, of other policies or of
+        other sources of the simulation.
+    """
+
+    def __init__(self, folder: Path, plan: Plan) -> None:
+        self.folder, self.plan = folder, plan
+        record = plan_record(plan)
+        folder.mkdir(parents=True, exist_ok=True)
+        claim(folder / PLAN_FILE, record, ("plan", "policies", "scenarios", "sources"), "results")
+        self.lines = self._read()
+
+    def _read(self) -> dict[Episode, dict[str, Any]]:
+        """Complete lines only: a half-written last line of a killed process is removed."""
+        path = self.folder / RUNS_FILE
+        if not path.exists():
+            return {}
+        data = path.read_bytes()
+        whole = data[: data.rfind(b"\n") + 1]
+        if len(whole) < len(data):
+            with atomic(path, "wb") as file:
+                file.write(whole)
+        lines: dict[Episode, dict[str, Any]] = {}
+        for number, text in enumerate(whole.splitlines(), start=1):
+            try:
+                line = json.loads(text)
+                lines[Episode.of_line(line)] = line
+            except (ValueError, KeyError, TypeError) as error:
+                raise ValueError(f"{path}, line {number} is damaged; remove it") from error
+        return lines
+
+    def add(self, line: dict[str, Any]) -> None:
+        """Append one episode; it is on the disk when this returns."""
+        text = json.dumps(line, allow_nan=False) + "\n"
+        handle = os.open(self.folder / RUNS_FILE, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            os.write(handle, text.encode())
+            os.fsync(handle)
+        finally:
+            os.close(handle)
+        self.lines[Episode.of_line(line)] = line
+
+    def missing(self) -> list[Episode]:
+        """Episodes that have not been run."""
+        return [episode for episode in self.plan.episodes() if episode not in self.lines]
+
+    def ordered(self) -> list[dict[str, Any]]:
+        """The finished lines in the plan's order."""
+        return [self.lines[episode] for episode in self.plan.episodes() if episode in self.lines]

@@ -1,0 +1,157 @@
+"""The plane of a figure of one run: paths, and robots drawn to scale at some times."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.colors import to_rgb
+from matplotlib.patches import Circle
+from matplotlib.patheffects import withStroke
+
+from baselines.runs.panels import MOST_POINTS, robot_colour, round_above
+from baselines.runs.run import Record
+from baselines.runs.style import MARKERS, tidy
+from tlf_env.rendering.looks import CASTOR_WIDTH_MM, DRIVE_WHEEL_WIDTH_MM, NOSE
+
+PLANE_IN = 5.6  # height of the plane
+SLIMMEST, WIDEST = 0.6, 1.8  # its width by its height
+SNAPSHOTS = 4  # times at which the robots are drawn, at most
+SNAPSHOT_ROOM = 1.5  # between robots of different times, in outline diameters
+FADED = 0.5
+
+
+def body_polygons(record: Record, k: int, i: int) -> list[np.ndarray]:
+    """Robot ``i`` at row ``k``, to scale, mm: left wheel, right wheel, castor, nose; each (corner, 2).
+
+    Body axes are e = (cos θ, sin θ), right, and f = (−sin θ, cos θ), forward. The castor's fork is
+    turned by ``castor_rad`` and its wheel trails behind the pivot.
+    """
+    robot = record.scenario.robot_models[i]
+    c = np.array([record["x_mm"][k, i], record["y_mm"][k, i]])
+    theta = record["theta_rad"][k, i]
+    body, fork = _axes_of(theta), _axes_of(theta + record["castor_rad"][k, i])
+    half_mm = robot.axle_width_mm / 2
+    front_mm = robot.outline_radius_mm - robot.outline_offset_mm
+    tyre = _rectangle(DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm)
+    castor = _rectangle(CASTOR_WIDTH_MM, 2 * robot.castor_radius_mm)
+    pivot = c - robot.castor_pivot_mm * body[1]
+    return [
+        c - half_mm * body[0] + tyre @ body,
+        c + half_mm * body[0] + tyre @ body,
+        pivot + (castor - (0, robot.castor_trail_mm)) @ fork,
+        c + front_mm * np.array(NOSE) @ body,
+    ]
+
+
+def snapshot_rows(record: Record) -> list[int]:
+    """Rows at which to draw the robots: the last, then those farthest from the robots already chosen."""
+    every_s = round_above(record.t_s[-1] / 100)
+    every = max(1, round(every_s / record.scenario.control_period_s))
+    room_mm = SNAPSHOT_ROOM * 2 * _largest_radius_mm(record)
+    places = _places(record)
+    last = len(places) - 1
+    chosen, candidates = [last], list(range(0, last, every))
+    while candidates and len(chosen) < SNAPSHOTS:
+        drawn = places[chosen].reshape(-1, 2)
+        apart = [np.linalg.norm(places[k][:, None] - drawn, axis=-1).min() for k in candidates]
+        if max(apart) < room_mm:
+            break
+        chosen.append(candidates.pop(int(np.argmax(apart))))
+    return chosen
+
+
+def _axes_of(theta: float) -> np.ndarray:
+    return np.array([[np.cos(theta), np.sin(theta)], [-np.sin(theta), np.cos(theta)]])
+
+
+def _rectangle(width: float, length: float) -> np.ndarray:
+    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, length / 2)
+
+
+def _places(record: Record) -> np.ndarray:
+    """(time, robot, 2), mm."""
+    return np.stack([record["x_mm"], record["y_mm"]], axis=-1)
+
+
+def _largest_radius_mm(record: Record) -> float:
+    return max(robot.outline_radius_mm for robot in record.scenario.robot_models)
+
+
+def _extent(record: Record) -> tuple[np.ndarray, np.ndarray]:
+    """Lower left and upper right corner of the plane, mm, with room for the bodies."""
+    everything = np.concatenate([_places(record).reshape(-1, 2), record.leader])
+    room_mm = 2.5 * _largest_radius_mm(record)
+    low, high = everything.min(axis=0) - room_mm, everything.max(axis=0) + room_mm
+    width, height = size = high - low
+    more = np.maximum(size, (height * SLIMMEST, width / WIDEST)) - size
+    return low - more / 2, high + more / 2
+
+
+def plane_width_in(record: Record) -> float:
+    """Width of the plane for its height, inches."""
+    low, high = _extent(record)
+    width, height = high - low
+    return float(PLANE_IN * width / height)
+
+
+def draw_plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
+    """The leader's reference, every path, and the robots at ``rows``; those at the first row are solid."""
+    n, low_high = record.robots, np.stack(_extent(record))
+    every = max(1, len(record.t_s) // MOST_POINTS)
+    axes.plot(*record.leader[::every].T, color="0.8", lw=5.0, zorder=1, label="leader's reference")
+    for i in range(n):  # later robots on top and thinner, so that coinciding paths are all visible
+        style: dict[str, Any] = {
+            "color": robot_colour(record, i),
+            "marker": MARKERS[i % len(MARKERS)],
+            "mfc": "white",
+        }
+        path = _places(record)[::every, i]
+        width = 1.0 + 2.5 * (n - 1 - i) / max(n - 1, 1)
+        axes.plot(*path.T, **style, markevery=[0], lw=width, zorder=2, label=f"robot {i}")
+        axes.plot(*path[:1].T, **style, zorder=2.2)  # the start once more, above all paths
+    for k in reversed(rows):
+        for i in range(n):
+            _draw_body(record, axes, k, i, strength=1.0 if k == rows[0] else FADED)
+    for k in rows:
+        _time_label(record, axes, k, rows)
+    axes.set(xlim=low_high[:, 0], ylim=low_high[:, 1], aspect="equal")
+    axes.set(xlabel="x (mm)", ylabel="y (mm)")
+    tidy(axes)
+
+
+def _draw_body(record: Record, axes: Axes, k: int, i: int, strength: float) -> None:
+    robot = record.scenario.robot_models[i]
+    line = 1 - strength * (1 - np.array(to_rgb(robot_colour(record, i))))
+    centre = np.array([0, -robot.outline_offset_mm]) @ _axes_of(record["theta_rad"][k, i])
+    x, y = _places(record)[k, i] + centre
+    z = 2 + strength
+    fill, dark = 1 - 0.3 * (1 - line), 1 - strength * (1 - 0.7 * line)
+    axes.add_patch(Circle((x, y), robot.outline_radius_mm, fc=fill, ec=line, zorder=z))
+    axes.add_collection(PolyCollection(body_polygons(record, k, i), fc=[dark], zorder=z))
+
+
+def _time_label(record: Record, axes: Axes, k: int, rows: Sequence[int]) -> None:
+    """The time beside the leader, at the side farthest from robots and paths."""
+    places, (low, high) = _places(record), _extent(record)
+    busy = np.concatenate([places[:: max(1, len(places) // 1000)], places[list(rows)]])
+    half_mm = np.array([0.3, 0.12]) * (high - low)[1] / PLANE_IN  # of the text
+    turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    sides = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
+    radius_mm = record.scenario.robot_models[0].outline_radius_mm
+    beside = places[k, 0] + sides * (1.5 * radius_mm + half_mm)
+    apart = np.linalg.norm(beside[:, None] - busy.reshape(-1, 2), axis=-1).min(axis=1)
+    inside = np.all((beside - half_mm > low) & (beside + half_mm < high), axis=1)
+    axes.annotate(
+        f"{record.t_s[k]:g} s",
+        tuple(beside[np.argmax(np.where(inside, apart, -1.0))]),
+        ha="center",
+        va="center",
+        fontsize="small",
+        weight="bold" if k == rows[0] else "normal",
+        path_effects=[withStroke(linewidth=2.5, foreground="white")],
+        zorder=5,
+    )

@@ -1,0 +1,135 @@
+"""The environments that are timed: ours, alone and many at once, and the peers mpe2 and VMAS."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import partial
+from importlib.util import find_spec
+from typing import Any
+
+import numpy as np
+
+from baselines.policies.reference import ReferencePolicy
+from baselines.speed.moments import STEPS_KEPT, Moments, VectorRun
+from tlf_env.envs.parallel import parallel_env
+
+MPE2, VMAS, ALONE, VECTOR = (
+    "mpe2/simple_spread_v3",
+    "vmas/diff_drive",
+    "tlf_env/infinity-v0",
+    "tlf_env.FormationVectorEnv",
+)
+PEER_ROBOTS = 3  # of VMAS
+VMAS_SHARE = 0.1
+PEER_CYCLES = 25  # simple_spread's own default episode
+FORMATION_STEPS = (
+    25_000  # of all formations in one timing; at least MIN_STEPS and at most `steps` each
+)
+MIN_STEPS = 3
+
+
+@dataclass
+class TimedEnvironment:
+    """An environment to be timed: ``drive(steps)`` returns the seconds of the steps, without set-up."""
+
+    name: str
+    robots: int
+    drive: Callable[[int], float]  # steps → seconds
+    formations: int = 1
+    threads: int = 1
+    share: float = 1.0  # of the steps that the others take, for a slow environment
+
+    @property
+    def key(self) -> tuple[str, int, int, int]:
+        """Key of its results."""
+        return self.name, self.robots, self.formations, self.threads
+
+    def steps(self, steps: int) -> int:
+        """Steps of one timing if a single formation takes ``steps``."""
+        return max(MIN_STEPS, min(int(steps * self.share), FORMATION_STEPS // self.formations))
+
+
+def single_formation(robots: int, steps: int, scenario: Any = "infinity") -> TimedEnvironment:
+    """The pymunk environment, 20 substeps a step, along a closed-loop run of the reference.
+
+    The reference's actions are recorded first and replayed for the timing. So only the environment is
+    timed, on a realistic motion.
+    """
+    env = parallel_env(scenario, robots=robots, horizon_s=max(steps, 50) * 0.02)
+    policy = ReferencePolicy()
+    observations, _ = env.reset(seed=0)
+    recorded: list[dict[str, np.ndarray]] = []
+    while env.agents:
+        actions, _ = policy.predict(np.stack([observations[agent] for agent in env.agents]))
+        recorded.append(dict(zip(env.agents, actions, strict=True)))
+        observations, *_ = env.step(recorded[-1])
+
+    def drive(count: int) -> float:
+        env.reset(seed=0)
+        start = time.perf_counter()
+        for actions in recorded[:count]:
+            env.step(actions)
+        return time.perf_counter() - start
+
+    return TimedEnvironment(f"tlf_env/{env.scenario.name}-v0", robots, drive)
+
+
+def vector_environments(
+    robots: int, formations: Sequence[int], threads: Sequence[int], steps: int
+) -> list[TimedEnvironment]:
+    """The Gymnasium vector environment: one learner in each formation, all robots simulated."""
+    moments = Moments(robots, max(STEPS_KEPT, steps))
+    made = []
+    for count in formations:
+        run = VectorRun(moments, count)
+        made += [
+            TimedEnvironment(VECTOR, robots, partial(run.drive, threads=used), count, used)
+            for used in threads
+            if used == 1 or count > 1
+        ]
+    return made
+
+
+def mpe2_environment(robots: int) -> TimedEnvironment | None:
+    """mpe2's ``simple_spread_v3`` with continuous actions and as many agents; None without mpe2."""
+    if find_spec("mpe2") is None:
+        return None
+    from mpe2 import simple_spread_v3
+
+    env = simple_spread_v3.parallel_env(N=robots, continuous_actions=True, max_cycles=PEER_CYCLES)
+    env.reset(seed=0)
+    generator = np.random.default_rng(0)
+    recorded = [
+        {agent: generator.random(5, dtype=np.float32) for agent in env.possible_agents}
+        for _ in range(PEER_CYCLES)
+    ]
+
+    def drive(count: int) -> float:
+        total = 0.0
+        for _ in range(max(1, count // PEER_CYCLES)):
+            env.reset(seed=0)
+            start = time.perf_counter()
+            for actions in recorded:
+                env.step(actions)
+            total += time.perf_counter() - start
+        return total * count / (max(1, count // PEER_CYCLES) * PEER_CYCLES)
+
+    return TimedEnvironment(MPE2, robots, drive)
+
+
+def vmas_environments(formations: Sequence[int], threads: Sequence[int]) -> list[TimedEnvironment]:
+    """VMAS with its DiffDrive dynamics; empty without vmas."""
+    if find_spec("vmas") is None:
+        return []
+    from baselines.speed.vmas import vmas_drive
+
+    return [
+        TimedEnvironment(
+            VMAS, PEER_ROBOTS, vmas_drive(PEER_ROBOTS, count, used), count, used, VMAS_SHARE
+        )
+        for count in formations
+        for used in threads
+        if used == 1 or count > 1
+    ]

@@ -1,0 +1,124 @@
+"""Environments and models of a training, from its configuration."""
+
+from __future__ import annotations
+
+import inspect
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import torch
+from stable_baselines3 import PPO, SAC
+
+from baselines.sb3 import FormationVecEnv
+from baselines.training.config import TrainConfig
+
+OFF_POLICY_STEPS = 64
+
+
+def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
+    """All formations; every episode draws its disturbance from the config's.
+
+    Raises
+    ------
+    ValueError
+        if there are fewer seeds than formations.
+    """
+    tasks, shares = config.mixture()
+    envs = FormationVecEnv(tasks, config.formations, mixture=shares, threads=threads)
+    first, end = config.seeds
+    if end - first < config.formations:
+        raise ValueError(
+            f"formations {config.formations} need as many seeds; there are {end - first}"
+        )
+    return envs
+
+
+def make_model(config: TrainConfig, envs: FormationVecEnv, seed: int) -> Any:
+    """A new model of SB3.
+
+    Raises
+    ------
+    ValueError
+        for settings that the algorithm does not have, or values that it refuses.
+    """
+    network = config.network
+    layers = list(network.hidden)
+    policy: dict[str, Any] = {
+        "net_arch": layers,
+        "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network.activation],
+        "log_std_init": network.initial_log_std,
+    }
+    make, kind = algorithm(config)
+    if network.lstm is not None:
+        policy |= {"lstm_hidden_size": network.lstm}
+    if config.algorithm == "SAC":
+        del policy["log_std_init"]  # SAC computes it by a head
+    known = set(inspect.signature(make).parameters) - {"policy", "env", "seed"}
+    for name in config.settings:
+        if name not in known:
+            raise ValueError(f"settings.{name} is not one of {', '.join(sorted(known))}")
+    try:
+        model = make(kind, envs, policy_kwargs=policy, seed=seed, device="cpu", **config.settings)
+    except (TypeError, AssertionError) as error:
+        raise ValueError(f"settings: {config.algorithm} refuses them: {error}") from error
+    head = model.actor.mu if config.algorithm == "SAC" else model.policy.action_net
+    with torch.no_grad():
+        head.weight.mul_(network.action_gain)
+        head.bias.mul_(network.action_gain)
+    return model
+
+
+def algorithm(config: TrainConfig) -> tuple[Callable[..., Any], str]:
+    """The class of the algorithm, and SB3's name for its kind of policy.
+
+    Raises
+    ------
+    ValueError
+        if its package is missing.
+    """
+    if config.algorithm != "RecurrentPPO":
+        return {"PPO": PPO, "SAC": SAC}[config.algorithm], "MlpPolicy"
+    try:
+        from sb3_contrib import RecurrentPPO
+    except ModuleNotFoundError as error:
+        raise ValueError("RecurrentPPO needs sb3-contrib (pip install 'tlf-env[train]')") from error
+    return RecurrentPPO, "MlpLstmPolicy"
+
+
+def spread_out(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
+    """Bring the formations to different moments of their episodes, as they are later in a training.
+
+    Otherwise all of them would start at once, and the first rollouts would contain starts only.
+    """
+    envs.seed(first_seed)
+    seen = envs.reset()
+    longest = max(plant.scenario.horizon_steps for plant in envs.plants)
+    begin = [
+        longest - (np.arange(plant.formations) * plant.scenario.horizon_steps) // plant.formations
+        for plant in envs.plants
+    ]
+    state, starts = None, np.ones(envs.num_envs, dtype=np.bool_)
+    for step in range(longest):
+        actions, state = model.predict(seen, state, starts, deterministic=True)
+        seen, _, starts, _ = envs.step(actions)
+        for plant, moments in zip(envs.plants, begin, strict=True):
+            if (moments == step).any():
+                plant.reset(mask=moments == step)
+    model._last_obs = envs.observations()
+    model._last_episode_starts = np.ones(envs.num_envs, dtype=np.bool_)
+
+
+def rollout_steps(model: Any) -> int:
+    """Robot steps of one call of ``learn``: PPO's rollout; SAC updates many times during the call."""
+    steps = OFF_POLICY_STEPS if hasattr(model, "replay_buffer") else model.n_steps
+    return int(steps) * int(model.n_envs)
+
+
+def set_learning_rate(model: Any, config: TrainConfig) -> None:
+    """Let the learning rate fall linearly; SB3's own schedule covers one call of ``learn`` only."""
+    first = config.settings.get("learning_rate", 3e-4)
+    share = 1.0 - (1.0 - config.final_learning_rate_share) * min(
+        model.num_timesteps / config.robot_steps, 1.0
+    )
+    model.lr_schedule = lambda _: first * share

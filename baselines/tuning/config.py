@@ -1,0 +1,274 @@
+"""Configuration of ``tlf tune``: start, ranges, tasks, disturbances, seeds and objective of a search."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any, Literal, Self
+
+from pydantic import (
+    BaseModel,
+    Field,
+    FiniteFloat,
+    ValidationError,
+    field_validator,
+    model_validator,
+)
+
+from baselines.runs.nested import value_at, with_value
+from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
+from tlf_env.common.errors import one_line
+from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.presets import read_preset_or_file
+from tlf_env.onboard.controllers import ControllerFile, controller
+from tlf_env.onboard.slip_estimator import SlipEkfParameters
+from tlf_env.onboard.tracking import Controller, controller_row
+from tlf_env.task.metrics import ERROR_CAP_MM, FORMATION_SETTLE_S, LOST_RMS_MM
+from tlf_env.task.scenario import Scenario, load_scenario
+
+DIGITS = 6  # significant digits of a tried value
+SMALLEST = 1e-3  # a smaller measure counts as this
+# A measure counts up to its cap; in a failed run every measure counts as its cap.
+CAPS = {
+    "position_rmse_mm": LOST_RMS_MM,
+    "settled_formation_rmse_mm": LOST_RMS_MM,
+    "error_capped_mean_mm": ERROR_CAP_MM,
+    "torque_rms_Nmm": 15.0,
+}
+
+
+class Range(Frozen):
+    """Search range of a number, ends included."""
+
+    low: FiniteFloat
+    high: FiniteFloat
+    log: bool = False  # uniform in the logarithm
+    times: str | None = None  # the value is a factor on the number at this path
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if not self.low < self.high:
+            raise ValueError(f"low {self.low:g} must be below high {self.high:g}")
+        if self.log and self.low <= 0:
+            raise ValueError(f"low {self.low:g} must be above 0 with log true")
+        return self
+
+
+class CountedSeeds(Frozen):
+    """Seeds ``first`` to ``first + count - 1``."""
+
+    first: int = Field(ge=0)
+    count: int = Field(ge=1, le=1000)
+
+    @property
+    def all(self) -> list[int]:
+        """The seeds as a list."""
+        return list(range(self.first, self.first + self.count))
+
+
+class Choice(CountedSeeds):
+    """Seeds on which the best trials are compared with the start."""
+
+    finalists: int = Field(default=5, ge=1)  # without the start
+
+
+class Objective(Frozen):
+    """Weights of the logarithms of a run's measures, and the additional cost of a failed run."""
+
+    position_rmse_mm: NonNegative = 1.0  # of the worst robot
+    settled_formation_rmse_mm: NonNegative = 0.5  # of the worst robot
+    error_capped_mean_mm: NonNegative = 0.5  # mean over the robots
+    torque_rms_Nmm: NonNegative = 0.5  # RMS over the robots
+    failed: Positive = 3.0
+
+    def cost(self, measures: dict[str, float], failed: bool) -> float:
+        """Cost of a run: the weighted sum of the logarithms of its measures.
+
+        A failed run costs ``failed`` more than the largest possible cost of any other run.
+        """
+        total = self.failed if failed else 0.0
+        for name, cap in CAPS.items():
+            value = cap if failed else min(max(measures[name], SMALLEST), cap)
+            total += getattr(self, name) * math.log(value)
+        return total
+
+
+class TuneConfig(Frozen):
+    """A search. Paths are those of :class:`Controller` (``gains.k_1_per_s``) and of ``ekf_slip``."""
+
+    start: Controller  # or the name of a preset; the first trial
+    estimator: Literal["ekf-slip", "ekf", "truth"] = "ekf-slip"
+    ekf_slip: SlipEkfParameters = SlipEkfParameters()
+    search: dict[str, Range] = Field(min_length=1)
+    tasks: tuple[str, ...] = Field(min_length=1)
+    disturbances: tuple[str, ...] = Field(min_length=1)
+    seeds: CountedSeeds
+    choose: Choice
+    horizon_s: Positive
+    trials: int = Field(ge=1, le=100_000)  # in all, including the start
+    startup_trials: int = Field(default=20, ge=1)  # random trials before the sampler proposes
+    sampler_seed: int = Field(default=0, ge=0)
+    # A trial stops when so many more of its runs have failed than of the start's; None: never.
+    stop_after_failed: int | None = Field(default=2, ge=1)
+    objective: Objective = Objective()
+
+    @field_validator("start", mode="before")
+    @classmethod
+    def _named(cls, value: Any) -> Any:
+        return controller(value) if isinstance(value, str) else value
+
+    @field_validator("seeds", "choose", mode="after")
+    @classmethod
+    def _in_their_range(cls, value: CountedSeeds) -> CountedSeeds:
+        allowed = CHOOSING_SEEDS if isinstance(value, Choice) else TRAINING_SEEDS
+        check_seeds("seeds", (value.first, value.first + value.count), allowed)
+        return value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        self._check_paths()
+        self._check_ranges()
+        for names in (self.tasks, self.disturbances):
+            if len(set(names)) < len(names):
+                raise ValueError(f"{', '.join(names)}: each must be named once")
+        for scenario in self.scenarios(self.ekf_slip).values():
+            controller_row(self.start, scenario.control_period_s, scenario.preview_s)
+            settled = (scenario.robot_count - 1) * scenario.time_gap_s + FORMATION_SETTLE_S
+            if self.objective.settled_formation_rmse_mm and self.horizon_s <= settled:
+                raise ValueError(
+                    f"horizon_s {self.horizon_s:g} must be above {settled:g}, from when on the last "
+                    f"of {scenario.robot_count} robots is in formation"
+                )
+        return self
+
+    def _check_paths(self) -> None:
+        tree = self.tree
+        paths = [*_paths(Controller), *(f"ekf_slip.{path}" for path in _paths(SlipEkfParameters))]
+        for path, span in self.search.items():
+            for named in (path, span.times):
+                if named is not None and named not in paths:
+                    raise ValueError(f"search: {named!r} is not one of {', '.join(paths)}")
+                if named and named.startswith("ekf_slip.") and self.estimator != "ekf-slip":
+                    raise ValueError(f"search: {named!r} needs estimator 'ekf-slip'")
+            if span.times is not None:
+                other = self.search.get(span.times)
+                if span.times == path or (other is not None and other.times is not None):
+                    raise ValueError(
+                        f"search.{path}: times {span.times!r} must be a path whose own range has no times"
+                    )
+                base = value_at(tree, span.times)
+                if not base:
+                    raise ValueError(
+                        f"search.{path}: times {span.times!r} is {base} at the start; it must not be 0 "
+                        "or None"
+                    )
+
+    def _check_ranges(self) -> None:
+        for path, span in self.search.items():
+            begun = self.start_values[path]
+            if not isinstance(begun, float) or not span.low <= begun <= span.high:
+                raise ValueError(
+                    f"search.{path}: the start has {begun}; it must lie within {span.low:g} and "
+                    f"{span.high:g}"
+                )
+        for end in ("low", "high"):
+            for path, span in self.search.items():
+                try:
+                    self.built({**self.start_values, path: getattr(span, end)})
+                except ValueError as error:
+                    raise ValueError(f"search.{path}, {end}: {error}") from error
+
+    @property
+    def tree(self) -> dict[str, Any]:
+        """The start's numbers as nested mappings, for the paths."""
+        return {**self.start.model_dump(), "ekf_slip": self.ekf_slip.model_dump()}
+
+    @property
+    def start_values(self) -> dict[str, Any]:
+        """The start as values of the search: a number for each path, None for a limit left out."""
+        tree, values = self.tree, {}
+        for path, span in self.search.items():
+            value = value_at(tree, path)
+            if span.times is not None and value is not None:
+                value = _rounded(value / value_at(tree, span.times))
+            values[path] = value
+        return values
+
+    def built(self, values: dict[str, float]) -> ControllerFile:
+        """The controller and its on-board parts for a value of each path of the search.
+
+        Raises
+        ------
+        ValueError
+            for an invalid value.
+        """
+        tree = self.tree
+        for path in sorted(self.search, key=lambda path: self.search[path].times is not None):
+            times = self.search[path].times
+            factor = 1.0 if times is None else value_at(tree, times)
+            tree = with_value(tree, path, _rounded(values[path] * factor))
+        slip = tree.pop("ekf_slip") if self.estimator == "ekf-slip" else None
+        try:
+            return ControllerFile.model_validate(
+                {"controller": tree, "estimator": self.estimator, "ekf_slip": slip}
+            )
+        except ValidationError as error:
+            raise ValueError(one_line(error)) from error
+
+    def scenarios(self, ekf_slip: SlipEkfParameters | None) -> dict[str, Scenario]:
+        """The scenario of every task and disturbance, named ``"task, disturbance"``.
+
+        Raises
+        ------
+        ValueError
+            for an unknown task or disturbance, or a scenario that the batch plant or the law cannot run.
+        """
+        made = {}
+        for task in self.tasks:
+            for disturbance in self.disturbances:
+                scenario = load_scenario(
+                    task,
+                    disturbance=disturbance,
+                    estimator=self.estimator,
+                    ekf_slip=None if ekf_slip is None else ekf_slip.model_dump(),
+                    horizon_s=self.horizon_s,
+                    plant="batch",
+                )
+                if (scenario.action, scenario.observation) != ("twist", "tracking"):
+                    raise ValueError(
+                        f"task {task!r} must have action 'twist', observation 'tracking'"
+                    )
+                made[f"{task}, {disturbance}"] = scenario
+        return made
+
+
+def _paths(model: type[BaseModel], before: str = "") -> list[str]:
+    """Dotted paths of a model's numbers."""
+    found: list[str] = []
+    for name, field in model.model_fields.items():
+        kind = field.annotation
+        if isinstance(kind, type) and issubclass(kind, BaseModel):
+            found += _paths(kind, f"{before}{name}.")
+        elif kind is not bool and kind is not str:
+            found.append(before + name)
+    return found
+
+
+def _rounded(value: float) -> float:
+    return float(f"{value:.{DIGITS}g}")
+
+
+def load_tune(source: str | Path, *, trials: int | None = None) -> TuneConfig:
+    """A search from a preset's name (``tuned``) or a YAML file; ``trials`` overrides their number.
+
+    Raises
+    ------
+    ValueError
+        in one line that names the value and what is allowed.
+    """
+    found = read_preset_or_file("search", source)
+    try:
+        given = {} if trials is None else {"trials": trials}
+        return TuneConfig.model_validate(found | given)
+    except ValidationError as error:
+        raise ValueError(one_line(error)) from error

@@ -1,0 +1,82 @@
+"""What the commands share: ranges of seeds, failed runs, the recorded command, ``python -m baselines``."""
+
+import subprocess
+import sys
+
+import pytest
+
+from baselines.runs.outcome import failed
+from baselines.runs.provenance import command_line, installed_versions, versions
+from baselines.runs.run import SEEDS_PER_BLOCK, run_policy, seed_blocks
+from baselines.runs.seed_ranges import (
+    CHOOSING_SEEDS,
+    FIRST_TABLE_SEED,
+    TRAINING_SEEDS,
+    check_seeds,
+)
+from tlf_env.task.scenario import load_scenario
+
+
+def test_the_ranges_of_seeds_follow_each_other():
+    assert TRAINING_SEEDS[1] == CHOOSING_SEEDS[0]
+    assert CHOOSING_SEEDS[1] == FIRST_TABLE_SEED
+
+
+@pytest.mark.parametrize("allowed", [TRAINING_SEEDS, CHOOSING_SEEDS])
+def test_a_range_of_seeds_must_lie_within_its_use(allowed):
+    first, end = allowed
+    check_seeds("seeds", allowed, allowed)
+    check_seeds("seeds", (end - 1, end), allowed)
+    with pytest.raises(ValueError, match=rf"^my seeds {end - 1} to {end} must lie within"):
+        check_seeds("my seeds", (end - 1, end + 1), allowed)
+    with pytest.raises(ValueError, match=r"20000 and above are for tables$"):
+        check_seeds("seeds", (first - 1, end), allowed)
+    with pytest.raises(ValueError, match=rf"seeds {first}:{first} must be FIRST:END"):
+        check_seeds("seeds", (first, first), allowed)
+
+
+@pytest.mark.parametrize(("lost", "touched"), [(False, False), (True, False), (False, True)])
+def test_a_run_fails_if_a_robot_is_lost_or_touched(lost, touched):
+    fine = {"lost": False, "touched": False}
+    assert failed([fine, {"lost": lost, "touched": touched}, fine]) == (lost or touched)
+
+
+def test_a_record_and_its_line_fail_alike():
+    class Still:
+        def predict(self, observation, state=None, episode_start=None, deterministic=True):
+            return 0 * observation[:, :2], state
+
+    for horizon_s, fails in ((0.1, False), (10.0, True)):
+        record = run_policy(load_scenario(horizon_s=horizon_s), Still())
+        robots = record.metrics()
+        assert failed(robots) == failed([robot._asdict() for robot in robots]) == fails
+
+
+def test_blocks_hold_all_seeds_in_their_order():
+    seeds = list(range(2 * SEEDS_PER_BLOCK + 3))
+    blocks = list(seed_blocks(seeds))
+    assert [len(block) for block in blocks] == [SEEDS_PER_BLOCK, SEEDS_PER_BLOCK, 3]
+    assert [seed for block in blocks for seed in block] == seeds
+    assert list(seed_blocks([])) == []
+
+
+def test_the_recorded_command_leaves_out_where_it_ran():
+    words = "bench --out here --seeds 1:2 --processes=3 --ray auto --workers 2 --no-figures"
+    assert command_line(words.split()) == "tlf bench --seeds 1:2 --no-figures"
+
+
+def test_only_installed_packages_have_a_version():
+    assert list(installed_versions(("no-such-package", "numpy"))) == ["numpy"]
+    assert list(versions())[:3] == ["python", "tlf-env", "numpy"]
+
+
+@pytest.mark.parametrize("words", [["--help"], ["bench", "--help"]])
+def test_the_package_is_the_command_line(words):
+    command = [sys.executable, "-m", "baselines", *words]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "Usage:" in done.stdout
+    bad = subprocess.run(
+        [*command[:3], "run", "no_such"], capture_output=True, text=True, check=False
+    )
+    assert bad.returncode == 2
+    assert bad.stderr.startswith("tlf: scenario 'no_such'")
