@@ -35,7 +35,7 @@ def body_polygons(record: Record, k: int, i: int) -> list[np.ndarray]:
     theta = record["theta_rad"][k, i]
     body, fork = _axes_of(theta), _axes_of(theta + record["castor_rad"][k, i])
     half_mm = robot.axle_width_mm / 2
-    front_mm = robot.outline_radius_mm - robot.outline_offset_mm
+    front_mm = robot.outline_front_mm
     tyre = _rectangle(DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm)
     castor = _rectangle(CASTOR_WIDTH_MM, 2 * robot.castor_radius_mm)
     pivot = c - robot.castor_pivot_mm * body[1]

@@ -112,6 +112,11 @@ class RobotParameters(Frozen):
     steering_joint: JointFriction = _joint(0.05, 0.033, (2.5, 2.5, 3.0))
     joint_friction: bool = True  # False turns eq. (5) off for all joints
 
+    @property
+    def outline_front_mm(self) -> float:
+        """How far the outline reaches ahead of c."""
+        return self.outline_radius_mm - self.outline_offset_mm
+
     @model_validator(mode="after")
     def _check_loads(self) -> Self:
         total = 2 * self.drive_load_share + self.castor_load_share

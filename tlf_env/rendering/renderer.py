@@ -328,7 +328,7 @@ class Renderer:
         self._shapes.bar(
             body, (2 * half * view.scale, AXLE_MM * view.scale), mixed(FLOOR, colour, 0.6)
         )
-        ahead = robot.outline_radius_mm - robot.outline_offset_mm
+        ahead = robot.outline_front_mm
         self._shapes.fill(body.px((ahead * e, ahead * f) for e, f in NOSE), colour)
         fork = body.at(0, -robot.castor_pivot_mm, scene.castor_rad[number])
         castor = fork.at(0, -robot.castor_trail_mm)
