@@ -21,6 +21,7 @@ from baselines.benchmark.plan import Episode, Plan, parse_seeds, parse_sweep
 from baselines.benchmark.results import RUNS_FILE
 from baselines.cli import main
 from baselines.runs.nested import value_at, with_value
+from baselines.runs.provenance import physics_digest, simulation_digest
 from baselines.runs.run import run_policy
 from tlf_env.task.observation import sensor_entries
 from tlf_env.task.scenario import load_scenario
@@ -220,7 +221,7 @@ def test_policies_meet_the_same_starts_and_noise():
 def test_another_plan_in_the_same_folder_is_refused(tmp_path, change):
     run_bench(PLAN, tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match="holds results of another plan"):
+    with pytest.raises(ValueError, match=r"holds results with a different 'plan' in plan\.json"):
         run_bench(Plan(**(vars(PLAN) | change)), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -236,9 +237,22 @@ def test_a_policy_whose_file_changed_is_refused(tmp_path, monkeypatch):
     plan = Plan(("changing:Still",), ("infinity",), ("nominal",), (0, 1), overrides=SHORT)
     run_bench(plan, tmp_path / "out")
     with (tmp_path / "changing.py").open("a") as file:
-        file.write("# changed\n")
-    with pytest.raises(ValueError, match="another policies"):
+        file.write("# a comment\n")
+    run_bench(plan, tmp_path / "out")
+    with (tmp_path / "changing.py").open("a") as file:
+        file.write("changed = True\n")
+    with pytest.raises(ValueError, match="a different 'policies'"):
         run_bench(plan, tmp_path / "out")
+
+
+def test_a_changed_simulation_is_refused_and_every_line_names_its_physics(tmp_path, monkeypatch):
+    lines = run_bench(PLAN, tmp_path).ordered()
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    assert {line["physics"] for line in lines} == {plan["physics"]} == {physics_digest()}
+    assert plan["simulation"] == simulation_digest()
+    monkeypatch.setattr("baselines.benchmark.results.simulation_digest", lambda: "0" * 12)
+    with pytest.raises(ValueError, match="a different 'simulation'"):
+        run_bench(PLAN, tmp_path)
 
 
 def test_a_sweep_runs_every_value():

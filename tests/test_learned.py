@@ -528,7 +528,7 @@ def test_bench_compares_policies_that_act_otherwise(tmp_path, monkeypatch, capsy
     with pytest.raises(SystemExit) as end:
         run_tlf(words, monkeypatch)
     assert end.value.code == 2
-    assert "another policies" in capsys.readouterr().err
+    assert "a different 'policies' in plan.json" in capsys.readouterr().err
 
 
 # Against the learning library itself.

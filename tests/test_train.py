@@ -262,9 +262,9 @@ class TestTraining:
         from baselines.training.train import train
 
         train(load_config(CONFIG), 0, tmp_path)
-        with pytest.raises(ValueError, match="holds a training of another seed"):
+        with pytest.raises(ValueError, match="holds a training with a different 'seed'"):
             train(load_config(CONFIG), 1, tmp_path)
-        with pytest.raises(ValueError, match="holds a training of another config"):
+        with pytest.raises(ValueError, match="holds a training with a different 'config'"):
             train(load_config(CONFIG, robot_steps=900), 0, tmp_path)
 
     @pytest.mark.parametrize("damage", ["cut", "text", "other"])

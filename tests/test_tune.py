@@ -172,7 +172,8 @@ def test_another_search_in_the_same_folder_is_refused(tmp_path, monkeypatch, cha
     monkeypatch.setattr(search, "run_trial", quick)
     StoredStudy(config(), tmp_path)
     with pytest.raises(
-        ValueError, match=f"holds a search of another {named}; choose another --out"
+        ValueError,
+        match=f"holds a search with a different '{named}' in search.json; choose another --out",
     ):
         run_tune(config(**change), tmp_path)
 
@@ -183,7 +184,7 @@ def test_a_task_whose_file_changed_is_refused(tmp_path):
     path.write_text(text.format(200))
     StoredStudy(config(tasks=[str(path)]), tmp_path / "out")
     path.write_text(text.format(300))
-    with pytest.raises(ValueError, match="holds a search of another scenarios"):
+    with pytest.raises(ValueError, match="holds a search with a different 'scenarios'"):
         StoredStudy(config(tasks=[str(path)]), tmp_path / "out")
 
 

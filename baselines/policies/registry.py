@@ -14,6 +14,7 @@ from baselines.policies.card import WEIGHTS
 from baselines.policies.classical import FeedbackLinearisation, PurePursuit
 from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.policies.reference import ReferencePolicy
+from tlf_env.common.digest import code_of
 from tlf_env.onboard.controllers import controller_names
 from tlf_env.onboard.parts import Policy, load_part, make_part
 from tlf_env.task.actions import ACTION_SIZE
@@ -182,11 +183,22 @@ def fits(name: str, scenario: Scenario, *, action: str, observation: str) -> Non
 
 
 def policy_hash(name: str, policy: Policy) -> str | None:
-    """Twelve hexadecimal digits over the files that a policy is made from; None without files."""
+    """Twelve hexadecimal digits over the files that a policy is made from; None without files.
+
+    Comments, docstrings and layout of Python files do not count.
+    """
     files = [Path(name)] if name.endswith(".zip") else _source_files(policy)
     if not files:
         return None
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+    return hashlib.sha256(b"".join(map(_hashed_content, files))).hexdigest()[:12]
+
+
+def _hashed_content(path: Path) -> bytes:
+    data = path.read_bytes()
+    try:
+        return code_of(data.decode()).encode() if path.suffix == ".py" else data
+    except (SyntaxError, UnicodeDecodeError):  # another encoding, or changed since the import
+        return data
 
 
 def _source_files(policy: Policy) -> list[Path]:

@@ -53,7 +53,8 @@ def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) ->
     for key in keys:
         if before.get(key) != record[key]:
             raise ValueError(
-                f"{path.parent} holds {what} of another {key}; choose another --out, or remove it"
+                f"{path.parent} holds {what} with a different {key!r} in {path.name}; choose another "
+                "--out, or remove it"
             )
 
 
