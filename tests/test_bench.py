@@ -144,7 +144,7 @@ def test_a_torn_last_line_is_cut_and_run_again(tmp_path):
     assert lines_in(tmp_path) == len(PLAN.episodes())
 
 
-def test_a_damaged_line_is_told(tmp_path):
+def test_a_damaged_line_is_reported(tmp_path):
     run_bench(PLAN, tmp_path)
     path = tmp_path / RUNS_FILE
     path.write_bytes(b"{}\n" + path.read_bytes())
@@ -178,7 +178,7 @@ def test_the_table_is_the_same_from_a_ray_cluster(tmp_path):
 
 
 class Circling:
-    """Drives in a circle and keeps what it sees."""
+    """Drives in a circle and keeps its observations."""
 
     def __init__(self, turn):
         self.turn, self.seen = turn, []
@@ -268,7 +268,7 @@ def test_a_sweep_runs_every_value():
     assert level.scenario(Episode("", "infinity", "ice", 1.0, 0.5, 0)).disturbance.level == 0.5
 
 
-def test_a_swept_bench_tells_where_policies_break(tmp_path):
+def test_a_sweep_reports_the_breaking_points(tmp_path):
     plan = Plan(
         ("reference:consistent",), ("infinity",), ("nominal",), (0, 2), overrides=(("horizon_s", 20.0),),
         sweep="slip.delta_1_mm_s", sweep_values=(0.0, 2000.0),
@@ -295,13 +295,13 @@ def test_only_numbers_that_exist_can_be_swept():
 @pytest.mark.parametrize(
     "text", ["", "a", "a=1", "a=1:2", "a=1:2:1", "a=1:2:3:4", "=1:2:3", "a=x:2:3"]
 )
-def test_a_sweep_of_another_form_is_told(text):
+def test_a_sweep_of_another_form_is_reported(text):
     with pytest.raises(ValueError, match="must be PATH=FIRST:LAST:COUNT"):
         parse_sweep(text)
 
 
 @pytest.mark.parametrize("text", ["", "5", "5:5", "6:5", "-1:5", "a:b", "1:2:3"])
-def test_seeds_of_another_form_are_told(text):
+def test_seeds_of_another_form_are_reported(text):
     with pytest.raises(ValueError, match="must be FIRST:END"):
         parse_seeds(text)
 
@@ -370,7 +370,7 @@ def test_an_option_takes_precedence_over_the_plan(tmp_path, monkeypatch):
     assert (plan["seeds"], plan["overrides"]) == ([5, 6], [["horizon_s", 2.0]])
 
 
-def test_a_bench_without_arch_says_so_before_it_runs(tmp_path, monkeypatch):
+def test_a_bench_without_arch_is_refused_before_it_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'tlf-env\[bench\]'"):
         run_bench(PLAN, tmp_path / "out")

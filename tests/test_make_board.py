@@ -161,7 +161,7 @@ def test_the_best_of_a_column_fails_least_and_then_errs_least():
     assert shown[2:] == ["**3.0**", "**3.0**", "0.5 (1)", "(50)", "(100)"]  # a tie as it is shown
 
 
-def test_nobody_is_best_where_all_runs_fail():
+def test_no_policy_is_best_where_all_runs_fail():
     best = make_board.standing(cell("a", 100, 2000.0))
     assert make_board.shown(cell("a", 100, 2000.0), best) == "(100)"
 

@@ -23,7 +23,6 @@ from tlf_env.task.scenario import Scenario, load_scenario
 
 CLASSICAL = {"pure_pursuit": PurePursuit, "feedback_linearisation": FeedbackLinearisation}
 
-
 # Fields of the scenario that a policy may ask for: its observation, its action and the on-board parts.
 # The task and the disturbance are not among them: they are the same for all policies.
 OVERRIDABLE = (
@@ -59,10 +58,10 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     name
         ``reference`` or ``reference:GAINS``, where GAINS is a preset or the path of a controller file
         (``.yaml``), ``pure_pursuit``, ``feedback_linearisation``, the name of a shipped learned policy,
-        the path of a ``.safetensors`` with its card beside it, ``module:factory`` of an object with
-        SB3's ``predict``, or the path of an SB3 ``.zip``.
+        the path of a ``.safetensors`` file (with its card in the same folder), ``module:factory`` of an
+        object with SB3's ``predict``, or the path of an SB3 ``.zip`` file.
     trust
-        Allow an SB3 ``.zip``: loading one runs code that is in it.
+        Allow an SB3 ``.zip`` file: loading one runs code that it contains.
 
     Raises
     ------
@@ -100,7 +99,7 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
         try:
             fitted = load_scenario(scenario, **asked)
         except ValueError as error:
-            raise ValueError(f"policy {name!r} asks of the scenario: {error}") from error
+            raise ValueError(f"policy {name!r} asks for an invalid scenario: {error}") from error
         differing = {
             field: getattr(fitted, field)
             for field in asked
@@ -154,10 +153,10 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         return load_policy(name)
     head, _, tail = name.partition(":")
     if head == "reference" and name != "reference:":
-        fits(name, scenario, action="twist", observation="tracking")
+        check_interface(name, scenario, action="twist", observation="tracking")
         return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
     if head in CLASSICAL and not tail:
-        fits(name, scenario, action="twist", observation="tracking")
+        check_interface(name, scenario, action="twist", observation="tracking")
         return CLASSICAL[head](scenario.preview_s)
     if tail:
         return make_part("policy", name, load_part(name))
@@ -167,7 +166,7 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     )
 
 
-def fits(name: str, scenario: Scenario, *, action: str, observation: str) -> None:
+def check_interface(name: str, scenario: Scenario, *, action: str, observation: str) -> None:
     """Check that a policy's action and observation are the scenario's.
 
     Raises
@@ -249,4 +248,4 @@ def _algorithm_of(data: dict[str, object], path: Path) -> str:
     ):
         if key in data:
             return algorithm
-    raise ValueError(f"{path}: neither a PPO, SAC nor TD3 model of stable-baselines3")
+    raise ValueError(f"{path} is not a PPO, SAC or TD3 model of stable-baselines3")

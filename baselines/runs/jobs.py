@@ -60,7 +60,7 @@ def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) ->
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Lock a folder against other processes that lock it too; a killed process leaves no lock behind.
+    """Lock a folder against other processes that lock it; a killed process leaves no lock behind.
 
     Raises
     ------
@@ -98,7 +98,7 @@ def spread(
     ahead
         Jobs in flight per process.
     meanwhile
-        Called now and then while jobs run elsewhere.
+        Called at short intervals while jobs run elsewhere.
 
     Raises
     ------

@@ -79,7 +79,7 @@ def simulation_digest() -> str:
 def command_line(words: Sequence[str]) -> str:
     """The ``tlf`` command with the given words, without the options that change no result.
 
-    Those are ``--out``, ``--processes``, ``--workers`` and ``--ray``: they say where the command runs.
+    Those options, ``--out``, ``--processes``, ``--workers`` and ``--ray``, set where the command runs.
     """
     kept = ["tlf"]
     skip = False
