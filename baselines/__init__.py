@@ -1,4 +1,4 @@
-"""Policies that see observations only, and what is done with them: runs, figures, tables, training."""
+"""Policies that act on observations only, and tools for them: runs, figures, benchmark, tuning, training."""
 
 from __future__ import annotations
 

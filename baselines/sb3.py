@@ -21,7 +21,7 @@ Source = str | Path | Mapping[str, Any] | Scenario
 
 
 class Place(NamedTuple):
-    """Where a sub-environment is: which plant, formation in it, and robot."""
+    """Place of a sub-environment: number of the plant, of the formation in it, and of the robot."""
 
     plant: int
     formation: int
@@ -29,28 +29,28 @@ class Place(NamedTuple):
 
 
 class FormationVecEnv(VecEnv):
-    """Formations on the batch plant, each of whose robots is a sub-environment of its own.
+    """Formations on the batch plant; every robot is a sub-environment.
 
-    Robots of a formation follow each other: robot i of formation k is sub-environment k·n + i. They end
-    together; who ended the episode is terminated, the others are truncated
-    (``TimeLimit.truncated``), so that a learner bootstraps rightly. A formation begins again in the step
-    in which it ended, as SB3 has it; the last observation is ``terminal_observation``.
+    Robot i of formation k is sub-environment k·n + i, with n robots per formation. The robots of a
+    formation end together: the robot that ended the episode is terminated, the others are truncated
+    (``TimeLimit.truncated``), so that a learner bootstraps correctly. A formation restarts in the step in
+    which it ended, as SB3 requires; the last observation is ``terminal_observation``.
 
     Parameters
     ----------
     scenario
-        What :class:`~tlf_env.engine.batch.BatchPlant` takes; several tasks as a mapping
-        ``{name: one scenario, or a sequence of them}``, among which the formations are shared out.
+        A scenario as for :class:`~tlf_env.engine.batch.BatchPlant`; several tasks as a mapping
+        ``{name: one scenario, or a sequence of them}``, which share the formations.
     formations
-        How many in all.
+        Number of formations in all.
     mixture
-        Whether every episode draws its scenario among those of its task, or with what shares.
+        Whether every episode draws its scenario from those of its task; a sequence gives their shares.
     threads
-        How many work on a step; None takes one for each core.
+        Number of threads for a step; None: one per core.
     seed
         Formation k gets ``seed`` + k in the first ``reset``; random if None.
     **overrides
-        Fields of the scenarios; ``disturbance_level`` too.
+        Fields of the scenarios, and ``disturbance_level``.
 
     Raises
     ------
@@ -100,12 +100,12 @@ class FormationVecEnv(VecEnv):
                 mine, theirs = getattr(first, field), getattr(plant.scenario, field)
                 if mine != theirs:
                     raise ValueError(
-                        f"task {plant.scenario.name!r} has {field} {theirs!r}, the first {mine!r}; "
+                        f"task {plant.scenario.name!r} has {field} {theirs!r}, the first task {mine!r}; "
                         "tasks in one environment need the same"
                     )
 
     def place(self, index: int) -> Place:
-        """Where a sub-environment is."""
+        """Place of a sub-environment."""
         plant = int(np.searchsorted(self._ends, index, side="right")) - 1
         robots = self.plants[plant].scenario.robot_count
         formation, robot = divmod(index - int(self._ends[plant]), robots)
@@ -121,7 +121,7 @@ class FormationVecEnv(VecEnv):
         return self._seeds
 
     def reset(self) -> np.ndarray:
-        """Start an episode everywhere: of the seed given, else the next one. ``(num_envs, entries)``."""
+        """Start an episode of every formation, with the given seed or the next one; ``(num_envs, entries)``."""
         for plant, first in zip(self.plants, self._first, strict=False):
             plant.reset(None if self._seed is None else self._seed + int(first))
         self._seed = None
@@ -130,16 +130,16 @@ class FormationVecEnv(VecEnv):
         return self.observations()
 
     def step_async(self, actions: np.ndarray) -> None:
-        """Take the actions, ``(num_envs, 2)``."""
+        """Keep the actions, ``(num_envs, 2)``, for the step."""
         self._actions = np.asarray(actions)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """Advance everything by one control period: observations, rewards, dones, infos.
+        """Advance all formations by one control period: observations, rewards, dones, infos.
 
         Raises
         ------
         ValueError
-            for actions of another shape or not finite; nothing has changed.
+            for actions of another shape or not finite; then no state changes.
         """
         actions = self._actions
         if actions is None:
@@ -174,20 +174,20 @@ class FormationVecEnv(VecEnv):
         return self.observations(), rewards.astype(np.float32), dones, infos
 
     def _parts(self, rows: np.ndarray) -> Iterable[tuple[BatchPlant, np.ndarray]]:
-        """Each plant with its sub-environments' rows."""
+        """Each plant with the rows of its sub-environments."""
         for plant, first, end in zip(self.plants, self._ends, self._ends[1:], strict=False):
             yield plant, rows[first:end]
 
     def observations(self) -> np.ndarray:
-        """The present ones, ``(num_envs, entries)``; a copy: SB3 keeps them while it makes the next."""
+        """Current observations, ``(num_envs, entries)``; a copy, as SB3 keeps them during the next step."""
         width = self.plants[0].observations.shape[2]
         return np.concatenate([plant.observations.reshape(-1, width) for plant in self.plants])
 
     def close(self) -> None:
-        """Nothing is open."""
+        """Do nothing; there is nothing to close."""
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """``scenario``, ``place``, ``render_mode`` (None), or what ``set_attr`` has set.
+        """``scenario``, ``place``, ``render_mode`` (None), or an attribute from ``set_attr``.
 
         Raises
         ------
@@ -212,14 +212,14 @@ class FormationVecEnv(VecEnv):
         )
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Remember a value for sub-environments; ``get_attr`` gives it back. Nothing else changes."""
+        """Store a value for sub-environments, for ``get_attr``; it has no other effect."""
         for i in self._get_indices(indices):
             self._attributes[i][attr_name] = value
 
     def env_method(
         self, method_name: str, *method_args: Any, indices: Any = None, **method_kwargs: Any
     ) -> list[Any]:
-        """Call ``state()``, a robot's true state, or a callable that ``set_attr`` has set.
+        """Call ``state()``, a robot's true state, or a callable from ``set_attr``.
 
         Raises
         ------
@@ -236,14 +236,14 @@ class FormationVecEnv(VecEnv):
     def env_is_wrapped(
         self, wrapper_class: type[gymnasium.Wrapper], indices: Any = None
     ) -> list[bool]:
-        """False for each: nothing is between the plant and this."""
+        """False for each sub-environment: there are no wrappers."""
         return [False for _ in self._get_indices(indices)]
 
 
 def _tasks(
     scenario: Source | Sequence[Source] | Mapping[str, Source | Sequence[Source]],
 ) -> list[Any]:
-    """One scenario or sequence of them for each task."""
+    """One scenario, or a sequence of them, for each task."""
     if isinstance(scenario, Mapping) and "trajectory" not in scenario:
         if not scenario:
             raise ValueError("scenario: the mapping of tasks is empty")

@@ -43,7 +43,7 @@ def metrics_table(record: Record) -> Table:
             "–" if row[key] is None else f"{row[key]:.{digits}f}" for _, key, digits in columns
         ]
         ends = [name for name in ("lost", "touched") if row[name]]
-        table.add_row(str(i), *cells, " ".join(ends) or "held")
+        table.add_row(str(i), *cells, " ".join(ends) or "ok")
     return table
 
 
@@ -108,7 +108,7 @@ def training_table(curves: list[dict[str, Any]]) -> Table:
 
 
 def tune_table(found: dict[str, Any]) -> Table:
-    """The result of a search beside its start, on the tuning and the choosing seeds."""
+    """The result of a search compared with its start, on the tuning and the choosing seeds."""
     table = Table(title=f"trial {found['trial']}, less is better", box=SIMPLE_HEAD)
     for heading in ("seeds", "task, disturbance"):
         table.add_column(heading)

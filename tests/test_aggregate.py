@@ -243,7 +243,7 @@ def test_a_difference_that_is_not_significant_is_not_bold():
     assert page.sign({"difference": 1.0, "interval": None}, 0.0) == 0
 
 
-def test_an_entry_meets_the_rival_that_fails_least_and_then_errs_least(tmp_path, monkeypatch):
+def test_the_rival_of_an_entry_fails_least_and_then_errs_least(tmp_path, monkeypatch):
     monkeypatch.setattr(statistics, "REPEATS", 100)
     lines = [
         *runs("learned", (5.0, 6.0)),
@@ -261,7 +261,7 @@ def test_an_entry_meets_the_rival_that_fails_least_and_then_errs_least(tmp_path,
     assert "smaller in 1 of 1 rows, larger in 0, no significant difference in 0" in table
 
 
-def test_without_an_entry_the_first_by_score_meets_the_others(tmp_path, monkeypatch):
+def test_without_an_entry_the_first_by_score_is_compared(tmp_path, monkeypatch):
     monkeypatch.setattr(statistics, "REPEATS", 100)
     lines = [
         line(policy, seed, score=score)

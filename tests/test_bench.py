@@ -21,6 +21,7 @@ from baselines.benchmark.plan import Episode, Plan, parse_seeds, parse_sweep
 from baselines.benchmark.results import RUNS_FILE
 from baselines.cli import main
 from baselines.runs.nested import value_at, with_value
+from baselines.runs.provenance import physics_digest, simulation_digest
 from baselines.runs.run import run_policy
 from tlf_env.task.observation import sensor_entries
 from tlf_env.task.scenario import load_scenario
@@ -143,7 +144,7 @@ def test_a_torn_last_line_is_cut_and_run_again(tmp_path):
     assert lines_in(tmp_path) == len(PLAN.episodes())
 
 
-def test_a_damaged_line_is_told(tmp_path):
+def test_a_damaged_line_is_reported(tmp_path):
     run_bench(PLAN, tmp_path)
     path = tmp_path / RUNS_FILE
     path.write_bytes(b"{}\n" + path.read_bytes())
@@ -177,7 +178,7 @@ def test_the_table_is_the_same_from_a_ray_cluster(tmp_path):
 
 
 class Circling:
-    """Drives in a circle and keeps what it sees."""
+    """Drives in a circle and keeps its observations."""
 
     def __init__(self, turn):
         self.turn, self.seen = turn, []
@@ -220,7 +221,7 @@ def test_policies_meet_the_same_starts_and_noise():
 def test_another_plan_in_the_same_folder_is_refused(tmp_path, change):
     run_bench(PLAN, tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match="holds results of another plan"):
+    with pytest.raises(ValueError, match=r"holds results with a different 'plan' in plan\.json"):
         run_bench(Plan(**(vars(PLAN) | change)), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 
@@ -236,9 +237,22 @@ def test_a_policy_whose_file_changed_is_refused(tmp_path, monkeypatch):
     plan = Plan(("changing:Still",), ("infinity",), ("nominal",), (0, 1), overrides=SHORT)
     run_bench(plan, tmp_path / "out")
     with (tmp_path / "changing.py").open("a") as file:
-        file.write("# changed\n")
-    with pytest.raises(ValueError, match="another policies"):
+        file.write("# a comment\n")
+    run_bench(plan, tmp_path / "out")
+    with (tmp_path / "changing.py").open("a") as file:
+        file.write("changed = True\n")
+    with pytest.raises(ValueError, match="a different 'policies'"):
         run_bench(plan, tmp_path / "out")
+
+
+def test_a_changed_simulation_is_refused_and_every_line_names_its_physics(tmp_path, monkeypatch):
+    lines = run_bench(PLAN, tmp_path).ordered()
+    plan = json.loads((tmp_path / "plan.json").read_text())
+    assert {line["physics"] for line in lines} == {plan["physics"]} == {physics_digest()}
+    assert plan["simulation"] == simulation_digest()
+    monkeypatch.setattr("baselines.benchmark.results.simulation_digest", lambda: "0" * 12)
+    with pytest.raises(ValueError, match="a different 'simulation'"):
+        run_bench(PLAN, tmp_path)
 
 
 def test_a_sweep_runs_every_value():
@@ -254,7 +268,7 @@ def test_a_sweep_runs_every_value():
     assert level.scenario(Episode("", "infinity", "ice", 1.0, 0.5, 0)).disturbance.level == 0.5
 
 
-def test_a_swept_bench_tells_where_policies_break(tmp_path):
+def test_a_sweep_reports_the_breaking_points(tmp_path):
     plan = Plan(
         ("reference:consistent",), ("infinity",), ("nominal",), (0, 2), overrides=(("horizon_s", 20.0),),
         sweep="slip.delta_1_mm_s", sweep_values=(0.0, 2000.0),
@@ -281,13 +295,13 @@ def test_only_numbers_that_exist_can_be_swept():
 @pytest.mark.parametrize(
     "text", ["", "a", "a=1", "a=1:2", "a=1:2:1", "a=1:2:3:4", "=1:2:3", "a=x:2:3"]
 )
-def test_a_sweep_of_another_form_is_told(text):
+def test_a_sweep_of_another_form_is_reported(text):
     with pytest.raises(ValueError, match="must be PATH=FIRST:LAST:COUNT"):
         parse_sweep(text)
 
 
 @pytest.mark.parametrize("text", ["", "5", "5:5", "6:5", "-1:5", "a:b", "1:2:3"])
-def test_seeds_of_another_form_are_told(text):
+def test_seeds_of_another_form_are_reported(text):
     with pytest.raises(ValueError, match="must be FIRST:END"):
         parse_seeds(text)
 
@@ -356,7 +370,7 @@ def test_an_option_takes_precedence_over_the_plan(tmp_path, monkeypatch):
     assert (plan["seeds"], plan["overrides"]) == ([5, 6], [["horizon_s", 2.0]])
 
 
-def test_a_bench_without_arch_says_so_before_it_runs(tmp_path, monkeypatch):
+def test_a_bench_without_arch_is_refused_before_it_runs(tmp_path, monkeypatch):
     monkeypatch.setattr(bench, "find_spec", lambda name: None)
     with pytest.raises(ValueError, match=r"pip install 'tlf-env\[bench\]'"):
         run_bench(PLAN, tmp_path / "out")

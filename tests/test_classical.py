@@ -1,4 +1,4 @@
-"""The classical rivals: exact on an exact reference, their gains, and that they hold the tasks."""
+"""The classical policies: exact on an exact reference, their gains, and that they hold the tasks."""
 
 import math
 
@@ -18,7 +18,7 @@ TWISTS = [(400.0, 0.0), (300.0, 0.5), (250.0, -0.8), (0.0, 0.0)]
 
 
 def row(**seen):
-    """A scaled observation of what is named; a heading error of 0 unless told."""
+    """A scaled observation of what is named; the heading error is 0 by default."""
     values = {"cos_e_3": 1.0} | seen
     return np.array([values.get(name, 0.0) / entry.scale for name, entry in ENTRIES.items()])
 
@@ -90,7 +90,7 @@ def test_a_batch_is_its_rows(rival):
 
 @pytest.mark.parametrize("rival", RIVALS)
 @pytest.mark.parametrize("shape", [(), (3,), (2, len(ENTRIES) + 1), (1, 1, len(ENTRIES))])
-def test_a_wrong_shape_is_told(rival, shape):
+def test_a_wrong_shape_is_reported(rival, shape):
     with pytest.raises(ValueError, match="takes tracking observations of"):
         rival().predict(np.zeros(shape))
 

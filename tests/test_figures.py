@@ -114,7 +114,7 @@ def test_every_axis_has_a_unit(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["1", "3", "lost"])
-def test_an_axis_says_symlog_if_and_only_if_it_is(kind: str) -> None:
+def test_an_axis_is_labelled_symlog_if_and_only_if_it_is(kind: str) -> None:
     panels = [
         axes
         for name, draw in figures.FIGURES.items()
@@ -349,7 +349,7 @@ def test_thinning_keeps_the_ends_and_the_extremes(count: int) -> None:
 
 
 @pytest.mark.parametrize("n", range(1, 21))
-def test_colours_and_markers_tell_robots_apart(n: int) -> None:
+def test_colours_and_markers_distinguish_robots(n: int) -> None:
     run = replace(record("1"), lost_at_s=np.full(n, np.inf))
     colours = {tuple(to_rgb(robot_colour(run, i))) for i in range(n)}
     assert len(colours) == n

@@ -26,6 +26,7 @@ BOARD = json.loads((ROOT / "leaderboard.json").read_text("utf-8"))
 def test_a_slice_of_the_table_comes_out_again(line):
     again = run_episode(make_board.plan_of(BOARD), Episode.of_line(line))
     assert again["scenario_hash"] == line["scenario_hash"]
+    assert list(again) == list(line)
     fails = [any(robot["lost"] for robot in run["robots"]) for run in (again, line)]
     assert fails[0] == fails[1]
     if fails[1]:  # a lost run is chaos: its numbers hold on one machine only

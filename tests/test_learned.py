@@ -170,12 +170,12 @@ def test_draws_follow_the_gaussian_and_repeat(kind, tmp_path):
 
 
 @pytest.mark.parametrize("shape", [(ENTRIES + 1,), (3, ENTRIES - 1), (1, 3, ENTRIES), ()])
-def test_an_observation_of_another_shape_is_told(shape, tmp_path):
+def test_an_observation_of_another_shape_is_reported(shape, tmp_path):
     with pytest.raises(ValueError, match=f"takes tracking observations of {ENTRIES} entries"):
         load_policy(written(tmp_path)).predict(np.zeros(shape))
 
 
-def test_the_files_say_everything_and_come_out_the_same_twice(tmp_path):
+def test_the_files_are_complete_and_reproducible(tmp_path):
     first, second = written(tmp_path, name="a"), written(tmp_path, name="b")
     assert first.read_bytes() == second.read_bytes()
     card = read_policy(first).card
@@ -217,7 +217,7 @@ def refusal(path):
     return message
 
 
-def test_missing_files_are_told(tmp_path):
+def test_missing_files_are_reported(tmp_path):
     path = written(tmp_path)
     path.with_suffix(".json").unlink()
     assert "needs its card: cannot read" in refusal(path)
@@ -225,7 +225,7 @@ def test_missing_files_are_told(tmp_path):
     assert refusal(path).startswith(f"cannot read {path}: No such file")
 
 
-def test_an_unknown_name_is_told_with_those_there_are(tmp_path, monkeypatch):
+def test_an_unknown_name_is_reported_with_the_known_ones(tmp_path, monkeypatch):
     monkeypatch.setattr(learned, "SHIPPED", tmp_path)
     assert "there is none yet" in refusal("no_such")
     written(tmp_path, name="follower")
@@ -237,20 +237,20 @@ def test_an_unknown_name_is_told_with_those_there_are(tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("rest", [0, 5, 100, -1])
-def test_truncated_weights_are_told(rest, tmp_path):
+def test_truncated_weights_are_reported(rest, tmp_path):
     path = written(tmp_path)
     path.write_bytes(path.read_bytes()[:rest])
     assert "is not a complete safetensors file" in refusal(path)
 
 
 @pytest.mark.parametrize("data", [b"PK\x03\x04 a zip", b"\x80\x04\x95 a pickle" * 9, b"{}"])
-def test_what_is_no_safetensors_file_is_told(data, tmp_path):
+def test_a_file_of_another_format_is_reported(data, tmp_path):
     path = written(tmp_path)
     path.write_bytes(data)
     assert "is not a complete safetensors file" in refusal(path)
 
 
-def test_other_weights_than_the_cards_are_told(tmp_path):
+def test_other_weights_than_the_cards_are_reported(tmp_path):
     path = written(tmp_path)
     path.write_bytes(written(tmp_path, tensors=random_tensors(MLP, seed=9), name="b").read_bytes())
     assert "is not the file that policy.json describes: its sha256 is" in refusal(path)
@@ -268,7 +268,7 @@ def test_other_weights_than_the_cards_are_told(tmp_path):
         ({"log_std": np.array([0, np.inf], np.float32)}, "not finite"),
     ],
 )
-def test_tensors_that_are_not_the_networks_are_told(change, said, tmp_path):
+def test_tensors_that_do_not_fit_the_network_are_reported(change, said, tmp_path):
     path = written(tmp_path)
     tensors = {k: v for k, v in (random_tensors(MLP) | change).items() if v is not None}
     replace_weights(path, tensors)
@@ -276,7 +276,7 @@ def test_tensors_that_are_not_the_networks_are_told(change, said, tmp_path):
 
 
 @pytest.mark.parametrize("name", ["normalise.var", "normalise.clip"])
-def test_a_normalisation_that_cannot_be_is_told(name, tmp_path):
+def test_an_impossible_normalisation_is_reported(name, tmp_path):
     network = NETWORKS["normalised"]
     path = written(tmp_path, network)
     tensors = random_tensors(network)
@@ -307,21 +307,21 @@ def test_a_normalisation_that_cannot_be_is_told(name, tmp_path):
         ({"action": "residual", "residual_base": "x", "estimator": None}, "estimator must be"),
     ],
 )
-def test_a_card_that_is_none_is_told(change, said, tmp_path):
+def test_an_invalid_card_is_reported(change, said, tmp_path):
     path = written(tmp_path)
     change_card(path, lambda card: card | change)
     assert said in refusal(path)
 
 
 @pytest.mark.parametrize("key", ["algorithm", "entries", "weights_sha256", "seeds"])
-def test_a_card_that_lacks_something_is_told(key, tmp_path):
+def test_a_card_with_a_missing_field_is_reported(key, tmp_path):
     path = written(tmp_path)
     change_card(path, lambda card: {k: v for k, v in card.items() if k != key})
     assert f"{key}: Field required" in refusal(path)
 
 
 @pytest.mark.parametrize("text", ["", "{", "[1]", "\x00", '"text"'])
-def test_a_card_that_is_no_json_object_is_told(text, tmp_path):
+def test_a_card_that_is_not_a_json_object_is_reported(text, tmp_path):
     path = written(tmp_path)
     path.with_suffix(".json").write_text(text)
     assert "policy.json" in refusal(path)
@@ -348,7 +348,7 @@ def test_nothing_is_written_of_a_policy_that_is_wrong(tmp_path):
         ({"control_period_s": 0.01}, "with control_period_s 0.02, the scenario has 0.01"),
     ],
 )
-def test_a_policy_that_does_not_fit_is_told_with_both(fields, said, tmp_path):
+def test_a_policy_that_does_not_fit_is_reported_with_both_values(fields, said, tmp_path):
     path = str(written(tmp_path))
     scenario = load_scenario(**(SHORT | fields))
     for make in (make_policy, fit_policy):
@@ -379,7 +379,7 @@ def test_another_action_takes_whatever_estimator_is_set(tmp_path):
     assert fit_policy(path, load_scenario(estimator="truth", **SHORT)).scenario.privileged
 
 
-def test_an_entry_of_another_name_or_scale_is_told(tmp_path):
+def test_an_entry_of_another_name_or_scale_is_reported(tmp_path):
     path = written(tmp_path)
     change_card(path, lambda card: card | {"entries": card["entries"] | {"e_2": 400.0}})
     with pytest.raises(
@@ -392,7 +392,7 @@ def test_an_entry_of_another_name_or_scale_is_told(tmp_path):
         make_policy(str(path), TWIST)
 
 
-def test_where_its_residual_counts_goes_with_a_policy(tmp_path):
+def test_fade_and_reach_of_a_residual_belong_to_the_policy(tmp_path):
     fading = load_scenario(RESIDUAL, residual_fade_mm=4.0, residual_reach_mm=90.0)
     path = str(written(tmp_path, scenario=fading))
     _, scenario, overrides = fit_policy(path, TWIST)
@@ -402,7 +402,7 @@ def test_where_its_residual_counts_goes_with_a_policy(tmp_path):
         make_policy(path, load_scenario(fading, residual_fade_mm=5.0))
 
 
-def test_what_a_policy_asks_for_is_given_where_nobody_set_it(tmp_path):
+def test_a_policy_gets_the_fields_that_it_asks_for_if_they_are_not_set(tmp_path):
     path = str(written(tmp_path, scenario=RESIDUAL))
     policy, scenario, overrides = fit_policy(path, TWIST)
     assert overrides == {"action": "residual", "residual_base": "printed"}  # TWIST has its preview
@@ -451,7 +451,7 @@ def asking(tmp_path, monkeypatch):
 
 
 @pytest.mark.usefixtures("asking")
-def test_a_policy_of_ones_own_may_ask_too():
+def test_a_custom_policy_may_ask_for_fields():
     assert fit_policy("asking:Asking", TWIST).scenario is TWIST
     fitted = fit_policy("asking:Sensing", TWIST)
     assert (fitted.scenario.observation, fitted.scenario.action) == ("sensor", "residual")
@@ -463,7 +463,7 @@ def test_a_policy_of_ones_own_may_ask_too():
         fit_policy("asking:Odd", TWIST)
 
 
-def test_a_policy_that_asks_for_another_action_meets_the_same_draws(tmp_path):
+def test_a_policy_with_another_action_gets_the_same_draws(tmp_path):
     scenario = load_scenario(disturbance="start", horizon_s=2.0)
     still = {name: 0 * tensor for name, tensor in random_tensors(MLP).items()}
     needs = load_scenario(scenario, action="residual")
@@ -492,7 +492,9 @@ def run_tlf(words, monkeypatch):
     main()
 
 
-def test_run_gives_a_policy_what_it_asks_for_and_says_so(tmp_path, monkeypatch, capsys):
+def test_run_gives_a_policy_the_fields_that_it_asks_for_and_reports_them(
+    tmp_path, monkeypatch, capsys
+):
     monkeypatch.chdir(tmp_path)
     written(tmp_path, scenario=RESIDUAL)
     words = ["run", "infinity", "--policy", "policy.safetensors", "--horizon-s", "0.4"]
@@ -528,7 +530,7 @@ def test_bench_compares_policies_that_act_otherwise(tmp_path, monkeypatch, capsy
     with pytest.raises(SystemExit) as end:
         run_tlf(words, monkeypatch)
     assert end.value.code == 2
-    assert "another policies" in capsys.readouterr().err
+    assert "a different 'policies' in plan.json" in capsys.readouterr().err
 
 
 # Against the learning library itself.
@@ -588,7 +590,7 @@ def test_an_exported_model_acts_as_before(kind, learner, tmp_path):
     np.testing.assert_allclose(policy.predict(observations(1)[0])[0], wanted, atol=2e-6, rtol=0)
 
 
-def test_the_normalisation_goes_along(learner, tmp_path):
+def test_the_normalisation_is_exported(learner, tmp_path):
     from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
 
     from baselines.training.export import export_policy
@@ -603,7 +605,7 @@ def test_the_normalisation_goes_along(learner, tmp_path):
     np.testing.assert_allclose(load_policy(path).predict(seen)[0], wanted, atol=2e-6, rtol=0)
 
 
-def test_a_model_that_cannot_be_exported_is_told(learner, tmp_path):
+def test_a_model_that_cannot_be_exported_is_reported(learner, tmp_path):
     import torch
 
     from baselines.training.export import export_policy

@@ -227,7 +227,7 @@ def test_lost_is_also_an_rms_above_100_mm_in_the_last_30_percent():
     assert not metrics(of, position_error_mm=from_to(of, 0, 70, 1e3, 99.9))[0].lost
     assert metrics(of, position_error_mm=from_to(of, 0, 70, 0, 100.1))[0].lost
     (found, *_) = metrics(of, position_error_mm=from_to(of, 0, 70, 0, 100.1))
-    assert found.score == 100.0  # its moment is not known: the score's own error tells
+    assert found.score == 100.0  # its time is not known: only the score's own error counts
 
 
 def test_nothing_is_ever_nan():

@@ -83,7 +83,7 @@ def test_every_name_makes_a_policy_that_drives(name):
 @pytest.mark.parametrize(
     "name", ["", "no_such", "reference:no_such", "reference:", "pure_pursuit:tuned"]
 )
-def test_an_unknown_name_is_told(name):
+def test_an_unknown_name_is_reported(name):
     with pytest.raises(ValueError, match=r"^[^\n]+$"):
         make_policy(name, SCENARIO)
 
@@ -98,7 +98,7 @@ def test_the_tuned_reference_runs_on_an_estimate_of_the_slip():
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "truth", "ekf-slip"])
-def test_an_estimator_that_is_set_stands(estimator):
+def test_an_estimator_that_is_set_is_kept(estimator):
     fitted = fit_policy("reference:tuned", load_scenario(horizon_s=0.2, estimator=estimator))
     assert (fitted.overrides, fitted.scenario.estimator) == ({}, estimator)
 
@@ -145,7 +145,7 @@ def test_a_controller_file_may_ask_for_its_filter(tmp_path):
         ("controller: !!python/object:os.system {}", "is not YAML"),
     ],
 )
-def test_a_bad_controller_file_is_told_in_one_line(text, said, tmp_path):
+def test_a_bad_controller_file_is_reported_in_one_line(text, said, tmp_path):
     path = tmp_path / "mine.yaml"
     if text is not None:
         path.write_text(text)
@@ -168,7 +168,7 @@ def test_the_reference_has_the_scenarios_period():
     fastest = controller("tuned").limits.acceleration_mm_s2
     seen = np.zeros(len(tracking_entries((1.0,))), dtype=np.float64)
     seen[:4] = 1.0, 0.0, 0.0, 1.0  # the reference is far ahead
-    seen[list(tracking_entries(())).index("is_leader")] = 1.0  # nobody is in the way
+    seen[list(tracking_entries(())).index("is_leader")] = 1.0  # no predecessor in the way
     for period_s in (0.01, 0.02):
         scenario = load_scenario(control_period_s=period_s, preview_s=(1.0,), estimator="ekf-slip")
         action, _ = make_policy("reference:tuned", scenario).predict(seen)
@@ -227,20 +227,20 @@ def test_a_stack_of_unlike_robots_needs_a_row_for_each():
 
 @pytest.mark.parametrize("name", policy_names())
 @pytest.mark.parametrize("fields", [{"observation": "sensor"}, {"action": "wheel_speed"}])
-def test_a_policy_that_does_not_fit_is_told(name, fields):
+def test_a_policy_that_does_not_fit_is_reported(name, fields):
     with pytest.raises(ValueError, match="takes 'tracking' observations and gives 'twist'"):
         make_policy(name, load_scenario(**fields))
 
 
 @pytest.mark.usefixtures("own_module")
-def test_a_policy_of_ones_own_comes_from_a_factory():
+def test_a_policy_may_come_from_a_custom_factory():
     policy = make_policy("own_policies:Still", SCENARIO)
     record = run_policy(SCENARIO, policy)
     assert np.abs(np.diff(record["x_mm"], axis=0)).max() < 1e-6
 
 
 @pytest.mark.usefixtures("own_module")
-def test_a_policy_of_ones_own_must_predict_actions_of_the_right_shape():
+def test_a_custom_policy_must_predict_actions_of_the_right_shape():
     with pytest.raises(ValueError, match=r"has no predict\(\)"):
         make_policy("own_policies:nothing", SCENARIO)
     with pytest.raises(ValueError, match=r"must have the shape \(3, 2\), got \(3, 3\)"):
@@ -256,7 +256,7 @@ def test_a_policy_of_ones_own_must_predict_actions_of_the_right_shape():
         ("Short", r"predict\(observation\) cannot be called as predict\(observation, state, "),
     ],
 )
-def test_a_factory_that_makes_no_policy_is_told_in_one_line(name, message):
+def test_a_factory_that_makes_no_policy_is_reported_in_one_line(name, message):
     with pytest.raises(ValueError, match=rf"^policy 'own_policies:{name}'[^\n]*{message}"):
         make_policy(f"own_policies:{name}", SCENARIO)
 
@@ -272,7 +272,7 @@ PREDICTS = {
 
 @pytest.mark.usefixtures("own_module")
 @pytest.mark.parametrize(("name", "message"), PREDICTS.items())
-def test_a_prediction_that_is_no_pair_of_actions_and_state_is_told(name, message):
+def test_a_prediction_that_is_not_a_pair_of_actions_and_state_is_reported(name, message):
     """With two robots: two rows of actions alone could pass for a pair."""
     scenario = load_scenario(SCENARIO, robots=2)
     policy = make_policy(f"own_policies:{name}", scenario)
@@ -284,7 +284,7 @@ def test_a_prediction_that_is_no_pair_of_actions_and_state_is_told(name, message
 
 @pytest.mark.usefixtures("own_module")
 @pytest.mark.parametrize(("name", "message"), PREDICTS.items())
-def test_what_drives_the_others_is_checked_likewise(name, message):
+def test_the_policy_of_the_other_robots_is_checked(name, message):
     env = FormationEnv(SCENARIO, others=f"own_policies:{name}")
     env.reset(seed=0)
     with pytest.raises(ValueError, match=rf"^others: [^\n]*{message}[^\n]*$"):
@@ -303,7 +303,7 @@ def test_what_drives_the_others_is_checked_likewise(name, message):
         ["--policy", "reference:"],
     ],
 )
-def test_the_command_line_tells_a_wrong_part_in_one_line(words, monkeypatch, capsys, tmp_path):
+def test_the_command_line_reports_a_wrong_part_in_one_line(words, monkeypatch, capsys, tmp_path):
     out = ["--out", str(tmp_path / "out"), "--no-figures", "--horizon-s", "0.2"]
     monkeypatch.setattr(sys, "argv", ["tlf", "run", "stop_and_go", *words, *out])
     with pytest.raises(SystemExit) as left:
@@ -390,7 +390,7 @@ def test_a_model_of_stable_baselines_drives_every_robot(algorithm, learner, tmp_
 
 
 @pytest.mark.usefixtures("learner")
-def test_a_zip_that_is_no_model_is_told(tmp_path):
+def test_a_zip_that_is_not_a_model_is_reported(tmp_path):
     path = tmp_path / "model.zip"
     path.write_bytes(b"no zip")
     with pytest.raises(ValueError, match=r"model\.zip"):

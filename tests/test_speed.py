@@ -92,7 +92,7 @@ def test_recorded_actions_go_on_where_the_reference_went(moments):
     assert np.array_equal(runs[0].observations, runs[1].observations)
 
 
-def test_parts_of_a_step_are_told(monkeypatch):
+def test_the_parts_of_a_step_are_measured(monkeypatch):
     monkeypatch.setattr(parts, "PARTS_FORMATIONS", 4)
     found = parts.part_times(3, 4, 1)["us_per_formation_step"]
     assert set(found) == {

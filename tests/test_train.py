@@ -1,4 +1,4 @@
-"""``tlf train``: goes on to the same result, refuses what it cannot do, beats nobody by accident."""
+"""``tlf train``: it resumes to the same result and refuses what it cannot do."""
 
 from __future__ import annotations
 
@@ -89,7 +89,7 @@ def test_shipped_configs_are_valid(path: Path):
         ({"algorithm": "SAC", "imitation": {}}, "imitation needs algorithm PPO, got SAC"),
     ],
 )
-def test_a_wrong_config_is_told_in_one_line(changes: dict, said: str):
+def test_a_wrong_config_is_reported_in_one_line(changes: dict, said: str):
     with pytest.raises(ValueError) as error:  # noqa: PT011 - what it says is checked below
         load_config({**CONFIG, **changes})
     assert said in str(error.value)
@@ -108,7 +108,7 @@ def command(tmp_path: Path, *words: str, **changes: object) -> list[str]:
     return ["tlf", "train", str(path), "--out", str(tmp_path / "out"), *words]
 
 
-def test_without_its_packages_training_says_what_to_install(tmp_path, monkeypatch, capsys):
+def test_without_its_packages_training_reports_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(__import__("sys").modules, "stable_baselines3", None)
     monkeypatch.delitem(__import__("sys").modules, "baselines.training.train_seeds", raising=False)
     monkeypatch.setattr("sys.argv", command(tmp_path))
@@ -127,7 +127,7 @@ class TestTraining:
         pytest.importorskip("sb3_contrib")
 
     @pytest.mark.parametrize("name", ALGORITHMS)
-    def test_an_interrupted_training_goes_on_to_the_same_policy(self, name, tmp_path):
+    def test_an_interrupted_training_continues_to_the_same_policy(self, name, tmp_path):
         from baselines.training.train import CHECKPOINT_FILE, POLICY_FILE, train
 
         config = load_config({**CONFIG, **ALGORITHMS[name]})
@@ -154,7 +154,7 @@ class TestTraining:
             tmp_path / "whole" / CHECKPOINT_FILE
         ).stat().st_size
 
-    def test_a_killed_training_goes_on_from_its_last_checkpoint(self, tmp_path):
+    def test_a_killed_training_continues_from_its_last_checkpoint(self, tmp_path):
         from baselines.training.train import POLICY_FILE, train
 
         config = load_config(CONFIG)
@@ -262,13 +262,13 @@ class TestTraining:
         from baselines.training.train import train
 
         train(load_config(CONFIG), 0, tmp_path)
-        with pytest.raises(ValueError, match="holds a training of another seed"):
+        with pytest.raises(ValueError, match="holds a training with a different 'seed'"):
             train(load_config(CONFIG), 1, tmp_path)
-        with pytest.raises(ValueError, match="holds a training of another config"):
+        with pytest.raises(ValueError, match="holds a training with a different 'config'"):
             train(load_config(CONFIG, robot_steps=900), 0, tmp_path)
 
     @pytest.mark.parametrize("damage", ["cut", "text", "other"])
-    def test_a_damaged_checkpoint_is_told_in_one_line(self, damage, tmp_path):
+    def test_a_damaged_checkpoint_is_reported_in_one_line(self, damage, tmp_path):
         from baselines.training.train import CHECKPOINT_FILE, train
 
         config = load_config(CONFIG)

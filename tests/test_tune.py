@@ -86,7 +86,7 @@ def trials(folder, settings):
 
 @pytest.fixture(scope="module")
 def whole(tmp_path_factory):
-    """Folder and result of a search that nobody interrupted."""
+    """Folder and result of a search without interruption."""
     folder = tmp_path_factory.mktemp("whole")
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(search, "run_trial", quick)
@@ -172,7 +172,8 @@ def test_another_search_in_the_same_folder_is_refused(tmp_path, monkeypatch, cha
     monkeypatch.setattr(search, "run_trial", quick)
     StoredStudy(config(), tmp_path)
     with pytest.raises(
-        ValueError, match=f"holds a search of another {named}; choose another --out"
+        ValueError,
+        match=f"holds a search with a different '{named}' in search.json; choose another --out",
     ):
         run_tune(config(**change), tmp_path)
 
@@ -183,7 +184,7 @@ def test_a_task_whose_file_changed_is_refused(tmp_path):
     path.write_text(text.format(200))
     StoredStudy(config(tasks=[str(path)]), tmp_path / "out")
     path.write_text(text.format(300))
-    with pytest.raises(ValueError, match="holds a search of another scenarios"):
+    with pytest.raises(ValueError, match="holds a search with a different 'scenarios'"):
         StoredStudy(config(tasks=[str(path)]), tmp_path / "out")
 
 
@@ -197,7 +198,7 @@ def test_two_at_once_in_a_folder_are_refused(tmp_path, monkeypatch):
     assert run_tune(config(trials=1), tmp_path) == run_tune(config(trials=1), tmp_path)
 
 
-def test_a_database_that_is_none_is_told(tmp_path):
+def test_a_file_that_is_not_a_database_is_reported(tmp_path):
     (tmp_path / STUDY_FILE).write_bytes(b"no database, " * 100)
     with pytest.raises(ValueError, match=r"study\.db cannot be read"):
         StoredStudy(config(), tmp_path)
@@ -362,7 +363,7 @@ def test_a_ray_cluster_drives_the_same_trials(tmp_path):
         ({"search": {"lead_s": {"low": 0, "high": 1, "steps": 3}}}, "search.lead_s.steps: unknown"),
         (
             {"search": {"lead_s": {"low": 0, "high": 1, "times": "lead_s"}}},
-            "own range has no times",
+            "has no times in its own range",
         ),
         ({"search": {"lead_s": {"low": 0, "high": 1, "times": "lead"}}}, "'lead' is not one of"),
         ({"tasks": ["no_such"]}, "no_such"),
@@ -433,7 +434,7 @@ def test_the_command_prints_its_result(tmp_path, monkeypatch, capsys):
     assert "--gains results/tune/search/tuned.yaml" in " ".join(printed[1].split())
 
 
-def test_an_interrupt_is_told_and_no_success(tmp_path, monkeypatch, capsys):
+def test_an_interrupt_is_reported_and_is_not_a_success(tmp_path, monkeypatch, capsys):
     def drive(settings, job):
         raise KeyboardInterrupt
 
@@ -462,7 +463,7 @@ def test_the_committed_result_is_of_the_committed_search():
     assert result.found["choose"]["found"]["score"] <= result.found["choose"]["start"]["score"]
 
 
-def test_a_search_may_say_its_start_in_numbers():
+def test_a_search_may_give_its_start_in_numbers():
     numbers = controller("tuned").model_dump()
     assert config(start=numbers) == config(start="tuned")
 
@@ -475,7 +476,7 @@ def test_a_ratio_follows_what_it_is_of():
     assert (gains.k_2_mm2_s, gains.k_3_mm2) == (6e4, 2e4)
 
 
-def test_without_optuna_the_command_says_so(tmp_path, monkeypatch):
+def test_without_optuna_the_command_reports_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "optuna", None)
     with pytest.raises(ValueError, match=r"pip install 'tlf-env\[tune\]'"):
         run_tune(config(), tmp_path / "out")

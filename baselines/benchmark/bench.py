@@ -17,8 +17,9 @@ from baselines.benchmark.plan import Episode, Plan
 from baselines.benchmark.results import Results
 from baselines.policies.registry import FittedPolicy, fit_policy
 from baselines.runs.jobs import spread
-from baselines.runs.provenance import scenario_hash
+from baselines.runs.provenance import physics_digest
 from baselines.runs.run import Record, run_policy, run_seeds, seed_blocks
+from tlf_env.task.neutral import scenario_hash
 
 IN_FLIGHT_PER_PROCESS = 4
 
@@ -51,6 +52,7 @@ def _line(episode: Episode, fitted: FittedPolicy, record: Record) -> dict[str, A
     return {
         **episode._asdict(),
         "scenario_hash": scenario_hash(scenario),
+        "physics": physics_digest(),
         "overrides": fitted.overrides,
         "privileged": scenario.privileged or bool(getattr(fitted.policy, "privileged", False)),
         "contact": record.contact,

@@ -136,12 +136,14 @@ def _point(
     cell: dict[str, Any],
     middle: float,
     ends: Sequence[float] | None,
-    y: float,
+    height: float,
 ) -> None:
     style = policy_style(board, cell["policy"])
     if ends is not None:
-        axes.plot(ends, [y, y], color=style["color"], lw=1.8, solid_capstyle="butt", zorder=2)
-    axes.plot([middle], [y], **{**style, "ls": "none", "ms": 5.5}, zorder=3, clip_on=False)
+        axes.plot(
+            ends, [height, height], color=style["color"], lw=1.8, solid_capstyle="butt", zorder=2
+        )
+    axes.plot([middle], [height], **{**style, "ls": "none", "ms": 5.5}, zorder=3, clip_on=False)
 
 
 FIGURES: dict[str, Callable[[Board], Figure]] = {

@@ -10,12 +10,13 @@ import numpy as np
 from baselines.runs.outcome import failed
 
 Line = dict[str, Any]
-Stratum = tuple[str, str, float | None]  # task, disturbance, value of the swept knob
+# A stratum, for which runs over seeds are compared: task, disturbance, value of the swept knob.
+Stratum = tuple[str, str, float | None]
 Strata = dict[Stratum, list[Line]]  # runs of one policy
 
 
 def failures(lines: Sequence[Line]) -> int:
-    """How many of the runs failed."""
+    """Number of failed runs."""
     return sum(failed(line["robots"]) for line in lines)
 
 

@@ -149,7 +149,7 @@ def task_tables(board: dict[str, Any], task: str) -> list[str]:
 
 
 def policy_label(row: dict[str, Any]) -> str:
-    """A policy's name, with the scenario fields that it sets, and marked if privileged."""
+    """A policy's name and the scenario fields that it sets; marked if privileged (uses the true state)."""
     marks = describe_overrides(row.get("overrides", {}))
     marks += ["privileged"] if row["privileged"] else []
     return row["policy"] + (f" ({'; '.join(marks)})" if marks else "")

@@ -36,7 +36,10 @@ class Episode(NamedTuple):
 
 @dataclass(frozen=True)
 class Plan:
-    """What is to be run. ``overrides`` are fields of every scenario; ``sweep`` is a knob's path."""
+    """The episodes to be run.
+
+    ``overrides`` are fields of every scenario; ``sweep`` is the path of a knob, a disturbance's parameter.
+    """
 
     policies: tuple[str, ...]
     tasks: tuple[str, ...]

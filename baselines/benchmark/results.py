@@ -11,10 +11,15 @@ from typing import Any
 from baselines.benchmark.plan import Episode, Plan
 from baselines.policies.registry import fit_policy, policy_hash
 from baselines.runs.jobs import claim
-from baselines.runs.provenance import git_revision, scenario_hash, versions
+from baselines.runs.provenance import (
+    git_revision,
+    physics_digest,
+    simulation_digest,
+    versions,
+)
 from tlf_env.common.files import atomic
-from tlf_env.numerics.compiled import sources_digest
 from tlf_env.numerics.philox import checked_seed
+from tlf_env.task.neutral import scenario_hash
 
 RUNS_FILE, PLAN_FILE, BOARD_FILE, PAGE_FILE = (
     "runs.jsonl",
@@ -22,6 +27,8 @@ RUNS_FILE, PLAN_FILE, BOARD_FILE, PAGE_FILE = (
     "leaderboard.json",
     "leaderboard.md",
 )
+
+CLAIMED = ("plan", "policies", "scenarios", "simulation")  # what must not change in a folder
 
 
 def plan_record(plan: Plan) -> dict[str, Any]:
@@ -52,7 +59,8 @@ def plan_record(plan: Plan) -> dict[str, Any]:
         "plan": json.loads(json.dumps(asked)),
         "policies": policies,
         "scenarios": scenarios,
-        "sources": sources_digest(),
+        "physics": physics_digest(),
+        "simulation": simulation_digest(),
         "versions": versions(),
         "git_revision": git_revision(),
     }
@@ -65,14 +73,14 @@ class Results:
     ------
     ValueError
         if the plan cannot run, or the folder holds results of another plan, of other policies or of
-        other sources of the simulation.
+        another simulation.
     """
 
     def __init__(self, folder: Path, plan: Plan) -> None:
         self.folder, self.plan = folder, plan
         record = plan_record(plan)
         folder.mkdir(parents=True, exist_ok=True)
-        claim(folder / PLAN_FILE, record, ("plan", "policies", "scenarios", "sources"), "results")
+        claim(folder / PLAN_FILE, record, CLAIMED, "results")
         self.lines = self._read()
 
     def _read(self) -> dict[Episode, dict[str, Any]]:

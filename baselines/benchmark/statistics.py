@@ -74,7 +74,7 @@ def _median(values: np.ndarray) -> float:
 
 
 def improvement(mine: np.ndarray, theirs: np.ndarray) -> float:
-    """Probability that a run of mine scores higher than one of theirs; ties count half."""
+    """Probability that a run of one policy scores higher than a run of another; ties count half."""
     difference = mine[:, None] - theirs[None, :]
     return float(np.mean((difference > 0) + 0.5 * (difference == 0)))
 
@@ -93,7 +93,7 @@ def crossing(values: Sequence[float], shares: Sequence[float], level: float) -> 
 def paired(values: Sequence[tuple[float | None, float | None]], how: str) -> dict[str, Any]:
     """Difference or ratio of two medians; its interval resamples pairs.
 
-    None if no pair is defined, and for a ratio whose divisor is 0 in some pair.
+    None if no pair is defined, and for a ratio with a divisor of 0 in some pair.
     """
     whole = np.array([pair for pair in values if None not in pair], dtype=np.float64)
     if not whole.size or (how == "ratio" and not np.all(whole[:, 1] > 0)):

@@ -52,7 +52,7 @@ def draw_sweep(board: Board) -> Figure:
         cells = [c for c in cells_of(board, task) if c["disturbance"] == disturbance]
         for policy in policies(board):
             mine = sorted(
-                (cell for cell in cells if cell["policy"] == policy), key=lambda c: c["sweep"]
+                (cell for cell in cells if cell["policy"] == policy), key=lambda cell: cell["sweep"]
             )
             _success_line(board, success, policy, mine)
             _error_line(board, error, policy, mine)

@@ -203,8 +203,8 @@ class LearnedPolicy:
             )
         h, c = (np.array(part[0], dtype=np.float32, order="C") for part in state)
         if episode_start is not None:
-            anew = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), len(rows))
-            h[anew] = c[anew] = 0.0
+            restarted = np.broadcast_to(np.asarray(episode_start, dtype=np.bool_), len(rows))
+            h[restarted] = c[restarted] = 0.0
         next_h, next_c = np.empty((2, *shape), dtype=np.float32)
         _lstm(rows, h, c, *self._lstm, next_h[0], next_c[0])
         return next_h, next_c

@@ -14,6 +14,7 @@ from baselines.policies.card import WEIGHTS
 from baselines.policies.classical import FeedbackLinearisation, PurePursuit
 from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.policies.reference import ReferencePolicy
+from tlf_env.common.digest import code_of
 from tlf_env.onboard.controllers import controller_names
 from tlf_env.onboard.parts import Policy, load_part, make_part
 from tlf_env.task.actions import ACTION_SIZE
@@ -21,7 +22,6 @@ from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import Scenario, load_scenario
 
 CLASSICAL = {"pure_pursuit": PurePursuit, "feedback_linearisation": FeedbackLinearisation}
-
 
 # Fields of the scenario that a policy may ask for: its observation, its action and the on-board parts.
 # The task and the disturbance are not among them: they are the same for all policies.
@@ -58,10 +58,10 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     name
         ``reference`` or ``reference:GAINS``, where GAINS is a preset or the path of a controller file
         (``.yaml``), ``pure_pursuit``, ``feedback_linearisation``, the name of a shipped learned policy,
-        the path of a ``.safetensors`` with its card beside it, ``module:factory`` of an object with
-        SB3's ``predict``, or the path of an SB3 ``.zip``.
+        the path of a ``.safetensors`` file (with its card in the same folder), ``module:factory`` of an
+        object with SB3's ``predict``, or the path of an SB3 ``.zip`` file.
     trust
-        Allow an SB3 ``.zip``: loading one runs code that is in it.
+        Allow an SB3 ``.zip`` file: loading one runs code that it contains.
 
     Raises
     ------
@@ -99,7 +99,7 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
         try:
             fitted = load_scenario(scenario, **asked)
         except ValueError as error:
-            raise ValueError(f"policy {name!r} asks of the scenario: {error}") from error
+            raise ValueError(f"policy {name!r} asks for an invalid scenario: {error}") from error
         differing = {
             field: getattr(fitted, field)
             for field in asked
@@ -153,10 +153,10 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         return load_policy(name)
     head, _, tail = name.partition(":")
     if head == "reference" and name != "reference:":
-        fits(name, scenario, action="twist", observation="tracking")
+        check_interface(name, scenario, action="twist", observation="tracking")
         return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
     if head in CLASSICAL and not tail:
-        fits(name, scenario, action="twist", observation="tracking")
+        check_interface(name, scenario, action="twist", observation="tracking")
         return CLASSICAL[head](scenario.preview_s)
     if tail:
         return make_part("policy", name, load_part(name))
@@ -166,7 +166,7 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     )
 
 
-def fits(name: str, scenario: Scenario, *, action: str, observation: str) -> None:
+def check_interface(name: str, scenario: Scenario, *, action: str, observation: str) -> None:
     """Check that a policy's action and observation are the scenario's.
 
     Raises
@@ -182,11 +182,22 @@ def fits(name: str, scenario: Scenario, *, action: str, observation: str) -> Non
 
 
 def policy_hash(name: str, policy: Policy) -> str | None:
-    """Twelve hexadecimal digits over the files that a policy is made from; None without files."""
+    """Twelve hexadecimal digits over the files that a policy is made from; None without files.
+
+    Comments, docstrings and layout of Python files do not count.
+    """
     files = [Path(name)] if name.endswith(".zip") else _source_files(policy)
     if not files:
         return None
-    return hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:12]
+    return hashlib.sha256(b"".join(map(_hashed_content, files))).hexdigest()[:12]
+
+
+def _hashed_content(path: Path) -> bytes:
+    data = path.read_bytes()
+    try:
+        return code_of(data.decode()).encode() if path.suffix == ".py" else data
+    except (SyntaxError, UnicodeDecodeError):  # another encoding, or changed since the import
+        return data
 
 
 def _source_files(policy: Policy) -> list[Path]:
@@ -237,4 +248,4 @@ def _algorithm_of(data: dict[str, object], path: Path) -> str:
     ):
         if key in data:
             return algorithm
-    raise ValueError(f"{path}: neither a PPO, SAC nor TD3 model of stable-baselines3")
+    raise ValueError(f"{path} is not a PPO, SAC or TD3 model of stable-baselines3")

@@ -1,1 +1,1 @@
-"""One recorded run, its figures, and what long commands share."""
+"""One recorded run, its files and figures, and code that the long commands share."""

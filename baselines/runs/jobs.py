@@ -53,13 +53,14 @@ def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) ->
     for key in keys:
         if before.get(key) != record[key]:
             raise ValueError(
-                f"{path.parent} holds {what} of another {key}; choose another --out, or remove it"
+                f"{path.parent} holds {what} with a different {key!r} in {path.name}; choose another "
+                "--out, or remove it"
             )
 
 
 @contextmanager
 def alone_in(folder: Path) -> Iterator[None]:
-    """Lock a folder against other processes that lock it too; a killed process leaves no lock behind.
+    """Lock a folder against other processes that lock it; a killed process leaves no lock behind.
 
     Raises
     ------
@@ -97,7 +98,7 @@ def spread(
     ahead
         Jobs in flight per process.
     meanwhile
-        Called now and then while jobs run elsewhere.
+        Called at short intervals while jobs run elsewhere.
 
     Raises
     ------

@@ -88,15 +88,15 @@ def robot_rows(
     return figure, dict(zip(robots.tolist(), grid, strict=True))
 
 
-def robot_colour(record: Record, i: int) -> str:
-    """The colour of robot ``i``."""
-    return hex_colour(i, record.robots)
+def robot_colour(record: Record, robot: int) -> str:
+    """Colour of a robot, by its number."""
+    return hex_colour(robot, record.robots)
 
 
 def robot_line(
     record: Record,
     axes: Axes,
-    i: int,
+    robot: int,
     t_s: np.ndarray,
     values: np.ndarray,
     jump: float = np.inf,
@@ -108,14 +108,14 @@ def robot_line(
     axes.plot(
         t_s,
         unbroken(values, jump),
-        color=robot_colour(record, i),
+        color=robot_colour(record, robot),
         lw=1.0,
-        marker=MARKERS[i % len(MARKERS)],
-        markevery=(every * (i + 1) // (record.robots + 1), every),
+        marker=MARKERS[robot % len(MARKERS)],
+        markevery=(every * (robot + 1) // (record.robots + 1), every),
         ms=4.5,
         mew=0.5,
         mec="white",
-        label=label or f"robot {i}",
+        label=label or f"robot {robot}",
     )
 
 

@@ -24,16 +24,16 @@ SNAPSHOT_ROOM = 1.5  # between robots of different times, in outline diameters
 FADED = 0.5
 
 
-def body_polygons(record: Record, k: int, i: int) -> list[np.ndarray]:
-    """Robot ``i`` at row ``k``, to scale, mm: left wheel, right wheel, castor, nose; each (corner, 2).
+def body_polygons(record: Record, row: int, number: int) -> list[np.ndarray]:
+    """A robot at a row, to scale, mm: left wheel, right wheel, castor, nose; each (corner, 2).
 
     Body axes are e = (cos θ, sin θ), right, and f = (−sin θ, cos θ), forward. The castor's fork is
     turned by ``castor_rad`` and its wheel trails behind the pivot.
     """
-    robot = record.scenario.robot_models[i]
-    c = np.array([record["x_mm"][k, i], record["y_mm"][k, i]])
-    theta = record["theta_rad"][k, i]
-    body, fork = _axes_of(theta), _axes_of(theta + record["castor_rad"][k, i])
+    robot = record.scenario.robot_models[number]
+    c = np.array([record["x_mm"][row, number], record["y_mm"][row, number]])
+    theta = record["theta_rad"][row, number]
+    body, fork = _axes_of(theta), _axes_of(theta + record["castor_rad"][row, number])
     half_mm = robot.axle_width_mm / 2
     front_mm = robot.outline_front_mm
     tyre = _rectangle(DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm)
@@ -123,18 +123,18 @@ def draw_plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
     tidy(axes)
 
 
-def _draw_body(record: Record, axes: Axes, k: int, i: int, strength: float) -> None:
-    robot = record.scenario.robot_models[i]
-    line = 1 - strength * (1 - np.array(to_rgb(robot_colour(record, i))))
-    centre = np.array([0, -robot.outline_offset_mm]) @ _axes_of(record["theta_rad"][k, i])
-    x, y = _places(record)[k, i] + centre
+def _draw_body(record: Record, axes: Axes, row: int, number: int, strength: float) -> None:
+    robot = record.scenario.robot_models[number]
+    line = 1 - strength * (1 - np.array(to_rgb(robot_colour(record, number))))
+    centre = np.array([0, -robot.outline_offset_mm]) @ _axes_of(record["theta_rad"][row, number])
+    x, y = _places(record)[row, number] + centre
     z = 2 + strength
     fill, dark = 1 - 0.3 * (1 - line), 1 - strength * (1 - 0.7 * line)
     axes.add_patch(Circle((x, y), robot.outline_radius_mm, fc=fill, ec=line, zorder=z))
-    axes.add_collection(PolyCollection(body_polygons(record, k, i), fc=[dark], zorder=z))
+    axes.add_collection(PolyCollection(body_polygons(record, row, number), fc=[dark], zorder=z))
 
 
-def _time_label(record: Record, axes: Axes, k: int, rows: Sequence[int]) -> None:
+def _time_label(record: Record, axes: Axes, row: int, rows: Sequence[int]) -> None:
     """The time beside the leader, at the side farthest from robots and paths."""
     places, (low, high) = _places(record), _extent(record)
     busy = np.concatenate([places[:: max(1, len(places) // 1000)], places[list(rows)]])
@@ -142,16 +142,16 @@ def _time_label(record: Record, axes: Axes, k: int, rows: Sequence[int]) -> None
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     sides = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     radius_mm = record.scenario.robot_models[0].outline_radius_mm
-    beside = places[k, 0] + sides * (1.5 * radius_mm + half_mm)
+    beside = places[row, 0] + sides * (1.5 * radius_mm + half_mm)
     apart = np.linalg.norm(beside[:, None] - busy.reshape(-1, 2), axis=-1).min(axis=1)
     inside = np.all((beside - half_mm > low) & (beside + half_mm < high), axis=1)
     axes.annotate(
-        f"{record.t_s[k]:g} s",
+        f"{record.t_s[row]:g} s",
         tuple(beside[np.argmax(np.where(inside, apart, -1.0))]),
         ha="center",
         va="center",
         fontsize="small",
-        weight="bold" if k == rows[0] else "normal",
+        weight="bold" if row == rows[0] else "normal",
         path_effects=[withStroke(linewidth=2.5, foreground="white")],
         zorder=5,
     )

@@ -1,15 +1,18 @@
-"""What a result is recorded with: versions, the git revision, and the command that made it."""
+"""What is recorded with a result: versions, digests of the code, git revision, and command."""
 
 from __future__ import annotations
 
-import hashlib
+import functools
 import platform
 import subprocess
 from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-from tlf_env.task.scenario import Scenario
+import numba
+
+from tlf_env.common.digest import code_digest
+from tlf_env.numerics.compiled import PACKAGE, ROOMS_WITH_LAWS
 
 REPORTED_PACKAGES = ("tlf-env", "numpy", "numba", "gymnasium", "pettingzoo", "pymunk")
 PLACE_OPTIONS = ("--out", "--processes", "--workers", "--ray")
@@ -55,15 +58,28 @@ def git_revision() -> str | None:
     return revision + ("+" if changes else "")
 
 
-def scenario_hash(scenario: Scenario) -> str:
-    """Twelve digits that stand for everything an episode depends on but its seed."""
-    return hashlib.sha256(scenario.model_dump_json().encode()).hexdigest()[:12]
+@functools.cache
+def physics_digest() -> str:
+    """Digest of the code of the physics, without comments and docstrings.
+
+    Results with the same scenario hash and the same physics digest are comparable.
+    """
+    return code_digest(PACKAGE / room for room in ("physics", "numerics"))
+
+
+@functools.cache
+def simulation_digest() -> str:
+    """Digest of all code that can hold a law, without comments and docstrings, and of Numba's version.
+
+    Interrupted work is resumed only with the same simulation digest.
+    """
+    return code_digest((PACKAGE / room for room in ROOMS_WITH_LAWS), numba.__version__)
 
 
 def command_line(words: Sequence[str]) -> str:
     """The ``tlf`` command with the given words, without the options that change no result.
 
-    Those are ``--out``, ``--processes``, ``--workers`` and ``--ray``: they say where the command runs.
+    Those options, ``--out``, ``--processes``, ``--workers`` and ``--ray``, set where the command runs.
     """
     kept = ["tlf"]
     skip = False

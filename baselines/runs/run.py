@@ -63,9 +63,9 @@ INFO_PLACES = [Info._fields.index(name) for name in FROM_INFO]
 
 @dataclass(frozen=True)
 class Record:
-    """A finished run, one row per control step (the start included).
+    """A finished run, one row per control step, including the start.
 
-    Torques are means over the control step that ends at the row's time, ``slip_mm_s`` is its maximum.
+    Torques are means over the control step that ends at the row's time; ``slip_mm_s`` is the maximum.
     """
 
     scenario: Scenario
@@ -75,14 +75,14 @@ class Record:
     columns: dict[str, np.ndarray]  # each (time, robot)
     leader: np.ndarray  # (time, 2): the leader's reference path, mm
     lost_at_s: np.ndarray  # (robot,): when the error first passed lost_beyond_mm; infinite if never
-    touched_at_s: np.ndarray  # (robot,): when it first touched another; infinite if never
+    touched_at_s: np.ndarray  # (robot,): when it first touched another robot; infinite if never
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.columns[column]
 
     @property
     def robots(self) -> int:
-        """How many robots."""
+        """Number of robots."""
         return len(self.lost_at_s)
 
     @property
@@ -91,13 +91,13 @@ class Record:
         return bool(np.isfinite(self.touched_at_s).any())
 
     def metrics(self) -> list[RobotMetrics]:
-        """The summary of every robot."""
+        """Metrics of every robot."""
         return robot_metrics(
             self.scenario, self.t_s, self.columns, self.lost_at_s, self.touched_at_s
         )
 
     def string(self) -> StringMetrics:
-        """How errors grow along the string of robots."""
+        """Growth of the errors along the string of robots."""
         return string_metrics(self.scenario, self.columns, self.leader)
 
 
@@ -110,20 +110,20 @@ def run_policy(
     parts: Mapping[str, Factory] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Record:
-    """Drive a policy over the whole horizon, ends or not (``end_on=()``), and record everything.
+    """Run a policy over the whole horizon, without early ends (``end_on=()``), and record everything.
 
     Parameters
     ----------
     parts
-        Factories of the parts that the scenario names, where they are at hand as objects.
+        Factories of custom on-board parts of the scenario, if given as objects.
     progress
-        Called with the steps done and the steps in all.
+        Called with the steps done and their total.
 
     Raises
     ------
     ValueError
-        naming the policy, if its ``predict`` returns no pair of actions in their shape and a state;
-        naming part and factory, for a part that cannot be made.
+        naming the policy, if its ``predict`` does not return a pair of actions (in the right shape) and
+        a state; naming part and factory, for a part that cannot be made.
     """
     formation = Formation(scenario.model_copy(update={"end_on": ()}), parts)
     formation.reset(checked_seed(seed))
@@ -142,10 +142,10 @@ def run_policy(
 def run_seeds(
     scenario: Scenario, policy: Policy, seeds: Sequence[int], *, name: str = "policy"
 ) -> Iterator[Record]:
-    """The runs of several seeds side by side, without contact between robots; as :func:`run_policy`.
+    """Runs of several seeds side by side, without contact between robots; as :func:`run_policy`.
 
-    The policy is asked once a step for all rows, ``(seed · robots, entry)``; one that can only take the
-    rows of one formation is asked seed by seed.
+    The policy is called once per step with all rows, ``(seed · robots, entry)``. If it refuses them with
+    a ValueError, the seeds are run one after the other.
     """
     plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds))
     plant.reset(list(seeds))
@@ -170,18 +170,19 @@ def run_seeds(
 
 
 def seed_blocks(seeds: Sequence[ItemT]) -> Iterator[Sequence[ItemT]]:
-    """Blocks of up to 25 seeds (or of whatever has one), as many as run side by side."""
+    """Blocks of up to 25 seeds, or of items with one seed each: as many as run side by side."""
     for i in range(0, len(seeds), SEEDS_PER_BLOCK):
         yield seeds[i : i + SEEDS_PER_BLOCK]
 
 
 class _Driver:
-    """A policy and what it remembers of an episode."""
+    """A policy and its state during an episode."""
 
-    def __init__(self, policy: Policy, scenario: Scenario, a: Arrays, name: str) -> None:
+    def __init__(self, policy: Policy, scenario: Scenario, arrays: Arrays, name: str) -> None:
         self._policy, self._name = policy, name
-        self._seen = a.sensor_observations if scenario.observation == "sensor" else a.observations
-        self._shape = a.actions.shape
+        sensor = scenario.observation == "sensor"
+        self._seen = arrays.sensor_observations if sensor else arrays.observations
+        self._shape = arrays.actions.shape
         self._state: Any = None
         self._start = np.ones(self._shape[0] * self._shape[1], dtype=np.bool_)
 
@@ -196,29 +197,29 @@ class _Driver:
 
 
 class _Tape:
-    """Everything that a record needs of a run of some lanes, row by row."""
+    """Rows of the records of some lanes (formations), kept while they run."""
 
-    def __init__(self, a: Arrays, steps: int) -> None:
-        lanes, n = a.rewards.shape
-        self._arrays, self._steps = a, steps
+    def __init__(self, arrays: Arrays, steps: int) -> None:
+        lanes, n = arrays.rewards.shape
+        self._arrays, self._steps = arrays, steps
         self._infos = np.zeros((lanes, steps + 1, n, len(FROM_INFO)))
         self._wheels = np.zeros((lanes, steps + 1, len(FROM_WHEELS), n))
         self._lost_at_s, self._touched_at_s = np.full((2, lanes, n), np.inf)
         self.note(0, 0.0)
 
-    def note(self, k: int, period_s: float) -> None:
-        """Row ``k``."""
+    def note(self, step: int, period_s: float) -> None:
+        """Keep the row of a control step."""
         a = self._arrays
-        self._infos[:, k] = a.infos[:, :, INFO_PLACES]
+        self._infos[:, step] = a.infos[:, :, INFO_PLACES]
         motion, wanted = readout.named(a, "motion"), readout.named(a, "wanted")
-        self._wheels[:, k, 0] = motion.psi - motion.theta
-        self._wheels[:, k, 1] = motion.omega_l
-        self._wheels[:, k, 2] = motion.omega_r
-        self._wheels[:, k, 3] = wanted.left
-        self._wheels[:, k, 4] = wanted.right
+        self._wheels[:, step, 0] = motion.psi - motion.theta
+        self._wheels[:, step, 1] = motion.omega_l
+        self._wheels[:, step, 2] = motion.omega_r
+        self._wheels[:, step, 3] = wanted.left
+        self._wheels[:, step, 4] = wanted.right
         if a.lost_now.any() or a.touched_now.any():
-            self._lost_at_s[a.lost_now] = k * period_s
-            self._touched_at_s[a.touched_now] = k * period_s
+            self._lost_at_s[a.lost_now] = step * period_s
+            self._touched_at_s[a.touched_now] = step * period_s
 
     def record(self, lane: int, scenario: Scenario, seed: int, policy: str) -> Record:
         """The record of a lane."""

@@ -14,9 +14,9 @@ MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 GREY, PALE = "0.45", "0.88"
 
 
-def hex_colour(i: int, count: int) -> str:
-    """The colour of number ``i`` of ``count`` robots or policies, as ``#rrggbb``; the renderer's."""
-    return "#{:02x}{:02x}{:02x}".format(*robot_colours(count)[i])
+def hex_colour(number: int, count: int) -> str:
+    """Colour of one of ``count`` robots or policies, as ``#rrggbb``; the same as the renderer's."""
+    return "#{:02x}{:02x}{:02x}".format(*robot_colours(count)[number])
 
 
 def tidy(*panels: Axes) -> None:

@@ -1,1 +1,1 @@
-"""Steps per second, beside other environments."""
+"""Steps per second, compared with other environments."""

@@ -44,7 +44,7 @@ class Moments:
         self.lanes = np.flatnonzero(~plant.lost.any(axis=1))  # a lost robot may turn on the spot
 
     def places(self, formations: int) -> tuple[np.ndarray, np.ndarray]:
-        """Moment and recorded lane whose state each formation takes, both ``(formation,)``."""
+        """Moment and recorded lane of the state that each formation takes, both ``(formation,)``."""
         rows = np.arange(formations)
         return rows // len(self.lanes) % MOMENTS, self.lanes[rows % len(self.lanes)]
 

@@ -30,27 +30,27 @@ STAGES = ("actions", "substeps", "radio", "judging", "sensing")
 
 
 @driver
-def timed_step(a: Arrays, s: Settings, spent: np.ndarray) -> None:
+def timed_step(arrays: Arrays, settings: Settings, spent: np.ndarray) -> None:
     """A control step of all lanes, without contacts; adds each stage's processor time, µs.
 
     The last of :data:`STAGES` is measured by :func:`timed_sensing`.
     """
     lanes = np.empty(LANES_AT_ONCE, dtype=np.int64)
     near = np.empty(LANES_AT_ONCE, dtype=np.bool_)
-    formations = a.clock.shape[0]
+    formations = arrays.clock.shape[0]
     for begin in range(0, formations, LANES_AT_ONCE):
         end = min(begin + LANES_AT_ONCE, formations)
         for lane in range(begin, end):
             lanes[lane - begin] = lane
         start = processor_time_us()
-        take_all_actions(a, begin, end, s)
-        find_near(a, begin, end, near, s)
+        take_all_actions(arrays, begin, end, settings)
+        find_near(arrays, begin, end, near, settings)
         acted = processor_time_us()
-        advance(a, lanes[: end - begin], 0, s.substeps, True, True, s)
+        advance(arrays, lanes[: end - begin], 0, settings.substeps, True, True, settings)
         advanced = processor_time_us()
-        transmit_all(a, begin, end, s)
+        transmit_all(arrays, begin, end, settings)
         transmitted = processor_time_us()
-        look_all(a, begin, end, s)
+        look_all(arrays, begin, end, settings)
         looked = processor_time_us()
         spent[0] += acted - start
         spent[1] += advanced - acted
@@ -59,12 +59,20 @@ def timed_step(a: Arrays, s: Settings, spent: np.ndarray) -> None:
 
 
 @driver
-def timed_sensing(a: Arrays, s: Settings, spent: np.ndarray) -> None:
+def timed_sensing(arrays: Arrays, settings: Settings, spent: np.ndarray) -> None:
     """Sensors and estimators of a control step's substeps alone; the robots do not move."""
-    lanes = np.arange(a.clock.shape[0])
+    lanes = np.arange(arrays.clock.shape[0])
     for begin in range(0, lanes.shape[0], LANES_AT_ONCE):
         start = processor_time_us()
-        advance(a, lanes[begin : begin + LANES_AT_ONCE], 0, s.substeps, False, True, s)
+        advance(
+            arrays,
+            lanes[begin : begin + LANES_AT_ONCE],
+            0,
+            settings.substeps,
+            False,
+            True,
+            settings,
+        )
         spent[4] += processor_time_us() - start
 
 
@@ -74,21 +82,21 @@ def stage_times(plant: BatchPlant, steps: int) -> dict[str, float]:
     ``plant`` is the wheel loops and the plant in all substeps, copying in and out included;
     ``onboard`` is encoders, position fixes and EKF.
     """
-    a, s = plant.arrays, plant._settings
+    arrays, settings = plant.arrays, plant._settings
     spent = np.zeros(len(STAGES))
-    timed_step(a, s, spent)
+    timed_step(arrays, settings, spent)
     spent[:] = 0.0
     start = time.process_time()
     for _ in range(steps):
-        timed_step(a, s, spent)
+        timed_step(arrays, settings, spent)
     spent *= (
         (time.process_time() - start) * 1e6 / spent.sum()
     )  # the tick of clock() differs between systems
-    timed_sensing(a, s, np.zeros(len(STAGES)))
+    timed_sensing(arrays, settings, np.zeros(len(STAGES)))
     alone = np.zeros(len(STAGES))
     start = time.process_time()
     for _ in range(steps):
-        timed_sensing(a, s, alone)
+        timed_sensing(arrays, settings, alone)
     spent[4] = (time.process_time() - start) * 1e6
     each = spent / (steps * plant.formations)
     return {

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from baselines.policies.reference import ReferencePolicy
-from baselines.policies.registry import fits
+from baselines.policies.registry import check_interface
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import ImitationConfig, TrainConfig
 from tlf_env.onboard.controllers import controller
@@ -25,7 +25,7 @@ class Rows(NamedTuple):
 
 
 def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
-    """Fit a PPO model to the reference that ``config.imitation`` names (the teacher), and its critic, too.
+    """Fit a PPO model to the reference that ``config.imitation`` names (the teacher); its critic, too.
 
     In the first round the teacher drives all formations, with noise on its actions so that the data
     contain its corrections. The network is fitted to the teacher's actions, and the critic to the
@@ -42,7 +42,7 @@ def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
     wanted = config.imitation
     assert wanted is not None
     scenario = envs.plants[0].scenario
-    fits("the teacher", scenario, action="twist", observation="tracking")
+    check_interface("the teacher", scenario, action="twist", observation="tracking")
     known = controller(wanted.controller)
     free = {"acceleration_mm_s2": None, "yaw_acceleration_rad_s2": None}
     known = known.model_copy(update={"limits": known.limits.model_copy(update=free)})

@@ -22,6 +22,7 @@ import torch
 from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from baselines.runs.jobs import alone_in, claim
+from baselines.runs.provenance import simulation_digest
 from baselines.training.checkpoint import read_checkpoint, write_checkpoint
 from baselines.training.config import TrainConfig
 from baselines.training.curve import TrainingProgress, write_curve
@@ -35,7 +36,6 @@ from baselines.training.model import (
     spread_out,
 )
 from baselines.training.scoring import overall_mm, score_policy
-from tlf_env.numerics.compiled import sources_digest
 
 POLICY_FILE, CHECKPOINT_FILE, TRAINING_FILE = (
     "policy.safetensors",
@@ -198,12 +198,12 @@ def check_folder(config: TrainConfig, seed: int, folder: Path) -> None:
     Raises
     ------
     ValueError
-        if it holds another training, or one with other sources of the simulation.
+        if it holds another training, or one with another simulation.
     """
     plan = {
         "config": config.model_dump(mode="json"),
         "seed": seed,
-        "sources": sources_digest(),
+        "simulation": simulation_digest(),
         "torch": torch.__version__,
     }
     claim(folder / TRAINING_FILE, plan, list(plan), "a training")

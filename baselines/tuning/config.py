@@ -154,7 +154,7 @@ class TuneConfig(Frozen):
                 other = self.search.get(span.times)
                 if span.times == path or (other is not None and other.times is not None):
                     raise ValueError(
-                        f"search.{path}: times {span.times!r} must be a path whose own range has no times"
+                        f"search.{path}: times {span.times!r} must be a path that has no times in its own range"
                     )
                 base = value_at(tree, span.times)
                 if not base:

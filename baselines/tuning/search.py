@@ -15,12 +15,11 @@ from typing import Any
 import yaml
 
 from baselines.runs.jobs import alone_in, spread
-from baselines.runs.provenance import git_revision, versions
+from baselines.runs.provenance import git_revision, simulation_digest, versions
 from baselines.tuning.config import TuneConfig
 from baselines.tuning.study import StoredStudy, optuna_package
 from baselines.tuning.trial import Outcome, TrialJob, run_trial
 from tlf_env.common.files import atomic
-from tlf_env.numerics.compiled import sources_digest
 
 RESULT_FILE = "tuned.yaml"
 
@@ -117,7 +116,7 @@ def _result(study: StoredStudy, chosen: dict[int, Outcome], command: str) -> dic
                 for outcome in ranking
             ],
             "search": config.model_dump(mode="json"),
-            "simulation": sources_digest(),
+            "simulation": simulation_digest(),
             "versions": versions() | {"optuna": optuna_package().__version__},
             "git_revision": git_revision(),
         },

@@ -11,10 +11,10 @@ from typing import Any
 import numpy as np
 
 from baselines.runs.jobs import claim
-from baselines.runs.provenance import git_revision, scenario_hash, versions
+from baselines.runs.provenance import git_revision, simulation_digest, versions
 from baselines.tuning.config import TuneConfig
 from baselines.tuning.trial import Outcome, TrialJob
-from tlf_env.numerics.compiled import sources_digest
+from tlf_env.task.neutral import scenario_hash
 
 SEARCH_FILE, STUDY_FILE = "search.json", "study.db"
 STUDY_NAME = "tune"
@@ -31,7 +31,7 @@ class StoredStudy:
     Raises
     ------
     ValueError
-        if optuna is missing, the folder holds another search or one with other sources of the
+        if optuna is missing, the folder holds another search or one with another
         simulation, or its database cannot be read.
     """
 
@@ -47,7 +47,7 @@ class StoredStudy:
             place: scenario_hash(scenario)
             for place, scenario in config.scenarios(config.ekf_slip).items()
         }
-        record = {**asked, "scenarios": scenarios, "simulation": sources_digest()}
+        record = {**asked, "scenarios": scenarios, "simulation": simulation_digest()}
         folder.mkdir(parents=True, exist_ok=True)
         keys = tuple(record)
         record |= {"versions": versions(), "git_revision": git_revision()}
