@@ -459,7 +459,9 @@ def test_a_custom_policy_may_ask_for_fields():
     assert fit_policy("asking:Sensing", load_scenario(action="twist")).scenario.action == "twist"
     with pytest.raises(ValueError, match="must map fields of action, observation"):
         fit_policy("asking:Greedy", TWIST)
-    with pytest.raises(ValueError, match="policy 'asking:Odd' asks of the scenario: action: "):
+    with pytest.raises(
+        ValueError, match="policy 'asking:Odd' asks for an invalid scenario: action: "
+    ):
         fit_policy("asking:Odd", TWIST)
 
 

@@ -74,9 +74,7 @@ def new_figure(board: Board, width_in: float, height_in: float, note: str) -> Fi
     size = (width_in, height_in + rows * LEGEND_ROW_IN)
     figure = Figure(figsize=size, layout="constrained")
     first, end = board["plan"]["plan"]["seeds"]
-    figure.suptitle(
-        f"seeds {first} to {end - 1}, the same draws for all policies; {note}", fontsize="medium"
-    )
+    figure.suptitle(f"seeds {first} to {end - 1}, same draws for all; {note}", fontsize="medium")
     return figure
 
 

@@ -73,7 +73,7 @@ def failures(board: Board) -> Figure:
 
 def profiles(board: Board) -> Figure:
     """Share of runs above a score; every task and disturbance has the same weight."""
-    figure = new_figure(board, 7.0, 4.6, "tasks and disturbances have equal weights")
+    figure = new_figure(board, 7.0, 4.6, "equal weight per task and disturbance")
     axes = figure.subplots()
     for policy in policies(board):
         share = 100 * np.asarray(board["profiles"][policy])
