@@ -22,7 +22,7 @@ from baselines.policies.network import NORMALISATION, Network
 from tlf_env.common.errors import one_line
 from tlf_env.common.files import atomic
 from tlf_env.common.models import Frozen, NonNegative, Positive
-from tlf_env.task.actions import ACTION_ENTRIES
+from tlf_env.task.actions import ACTION_ENTRIES, ActionKind
 from tlf_env.task.observation import SAMPLE_ENTRIES, sensor_entries, tracking_entries
 from tlf_env.task.scenario import Scenario
 
@@ -40,7 +40,7 @@ class Card(Frozen):
     algorithm: Word  # PPO, SAC, RecurrentPPO, or the name of another trainer
 
     # What it was trained with, and has to be run with.
-    action: Literal["twist", "wheel_speed", "torque", "residual"]
+    action: ActionKind
     action_scales: tuple[Positive, Positive]  # value of 1.0: mm/s, rad/s, N·mm
     observation: Literal["tracking", "sensor"]
     entries: dict[str, Positive]  # that the policy takes, in its order, with their scales

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from pathlib import Path
-from typing import Any, Literal, Self
+from typing import Any, Self
 
 from pydantic import (
     BaseModel,
@@ -21,6 +21,7 @@ from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.common.presets import read_preset_or_file
 from tlf_env.onboard.controllers import ControllerFile, controller
+from tlf_env.onboard.kinds import EstimatorKind
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import Controller, controller_row
 from tlf_env.task.metrics import ERROR_CAP_MM, FORMATION_SETTLE_S, LOST_RMS_MM
@@ -97,7 +98,7 @@ class TuneConfig(Frozen):
     """A search. Paths are those of :class:`Controller` (``gains.k_1_per_s``) and of ``ekf_slip``."""
 
     start: Controller  # or the name of a preset; the first trial
-    estimator: Literal["ekf-slip", "ekf", "truth"] = "ekf-slip"
+    estimator: EstimatorKind = "ekf-slip"
     ekf_slip: SlipEkfParameters = SlipEkfParameters()
     search: dict[str, Range] = Field(min_length=1)
     tasks: tuple[str, ...] = Field(min_length=1)
