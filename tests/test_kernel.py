@@ -22,7 +22,14 @@ from physics_helpers import (
     wheel_slip,
 )
 
-from tlf_env.physics.parameters import FrictionCurve, JointFriction, RobotParameters, body
+from tlf_env.physics.parameters import (
+    Body,
+    FrictionCurve,
+    JointFriction,
+    Mass,
+    RobotParameters,
+    body,
+)
 from tlf_env.physics.state import Contact, Floor, Motion, conveyor
 
 SEEDS = range(24)
@@ -383,3 +390,8 @@ def test_grip_scales_the_force_of_a_sliding_wheel():
         after, _ = run(ROBOT, start, memory, seconds=DT_S, floor=(0, 0, grip, grip, grip)).at(-1)
         slowed = grip * ROBOT.tyre.mu_dynamic * ROBOT.gravity_mm_s2 * DT_S
         assert start.v_x - after.v_x == pytest.approx(slowed, rel=1e-6)
+
+
+def test_a_payload_s_constants_are_the_first_of_the_body():
+    """A payload is written over them by row."""
+    assert Body._fields[: len(Mass._fields)] == Mass._fields

@@ -176,6 +176,18 @@ def test_every_room_that_compiles_laws_is_in_the_digest():
             assert path.parent.parent == compiled.PACKAGE
 
 
+def test_outside_physics_the_body_is_imported_from_one_module():
+    allowed = {"vehicle", "units", "linear", "openloop", "pymunk_plant"}
+    for path in compiled.PACKAGE.rglob("*.py"):
+        if path.parent.name == "physics":
+            continue
+        for node in ast.walk(ast.parse(path.read_text())):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith(
+                "tlf_env.physics"
+            ):
+                assert node.module.removeprefix("tlf_env.physics.") in allowed, path
+
+
 def test_cache_lies_where_the_variable_says(tmp_path, monkeypatch):
     monkeypatch.setenv("TLF_ENV_CACHE", str(tmp_path / "new"))
     folder = compiled.cache_folder.__wrapped__()

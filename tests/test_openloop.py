@@ -265,7 +265,7 @@ def test_loads_that_do_not_add_up_are_refused():
     [
         ({"mu_static": -0.1}, "mu_static"),
         ({"mu_dynamic": -0.01}, "mu_dynamic"),
-        ({"mu_dynamic": 0.1}, "mu_dynamic 0.1 is above mu_static 0.073"),
+        ({"mu_dynamic": 0.1}, "mu_dynamic 0.1 must be at most mu_static 0.073"),
         ({"mu_static": math.nan}, "mu_static"),
         ({"stiction_speed_mm_s": 0.0}, "stiction_speed_mm_s"),
         ({"dynamic_speed_mm_s": 2.0}, "dynamic_speed_mm_s 2.0 must be above stiction_speed_mm_s"),

@@ -222,21 +222,21 @@ def predict_with_slip(
     ekf: SlipEkf,
     u_1: float,
     u_2: float,
-    asked_1: float,
-    asked_2: float,
+    commanded_1: float,
+    commanded_2: float,
     dt: float,
 ) -> tuple[Estimate, SlipEstimate]:
     """Pose, slip and covariance after one sample.
 
-    The wheels' increments are u₁ (mm) and u₂ (rad); ``asked`` the commanded increments, or the last ones
+    The wheels' increments are u₁ (mm) and u₂ (rad); ``commanded`` the commanded ones, or the last ones
     if there is no command.
     """
     change_1, change_2 = u_1 - slip.u_1, u_2 - slip.u_2
     usual_1, jump_1, spin_1 = split_change(
-        change_1, u_1 - asked_1, slip.spin_1, ekf.change_1, slip.roughness_1, ekf.grip_1
+        change_1, u_1 - commanded_1, slip.spin_1, ekf.change_1, slip.roughness_1, ekf.grip_1
     )
     usual_2, jump_2, spin_2 = split_change(
-        change_2, u_2 - asked_2, slip.spin_2, ekf.change_2, slip.roughness_2, ekf.grip_2
+        change_2, u_2 - commanded_2, slip.spin_2, ekf.change_2, slip.roughness_2, ekf.grip_2
     )
     delta_1, delta_2 = slip.delta_1 - jump_1 / dt, slip.delta_2 - jump_2 / dt
     moved, turned = u_1 - spin_1 + delta_1 * dt, u_2 - spin_2 + delta_2 * dt

@@ -11,7 +11,7 @@ from tlf_env.physics.parameters import Body
 
 
 class Motion(NamedTuple):
-    """Pose and velocities of the five bodies."""
+    """Pose and velocities of the five bodies. Heading 0 is +y (unlike ROS REP-103, where it is +x)."""
 
     x: float  # centre of mass, mm
     y: float

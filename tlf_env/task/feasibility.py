@@ -367,9 +367,9 @@ def _meetings(
         distance_mm, i, k = min(found)
         others = sorted(other for _, other, _ in found if other != i)
         names = ", ".join(str(other) for other in others[:NAMED]) + ", …" * (len(others) > NAMED)
-        more = f"; pairs {names} positions apart are too close as well" if others else ""
+        more = f"; robots i and i + {names} are too close as well" if others else ""
         yield (
             f"{_place(t_s, reference, k)}: robot_0 and robot_{i} are {distance_mm:.0f} mm apart, below "
-            f"{room_mm:.0f} mm, two outline radii; the same holds for every pair {i} positions apart, "
-            f"one gap later each{more}"
+            f"{room_mm:.0f} mm, two outline radii; the same holds for robots i and i + {i}, one "
+            f"gap later each{more}"
         )

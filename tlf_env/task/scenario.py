@@ -114,7 +114,7 @@ class Scenario(Frozen):
     adversary: bool = False  # whether a caller may set disturbance channels at every step
 
     action: ActionKind = "twist"
-    # Controller to whose twist a residual is added: a preset or a file.
+    # Base controller of the action `residual`, which is added to its twist: a preset or a file.
     residual_base: str = "consistent"
     # Estimated errors at which a residual has half its weight: the weight decreases below the first and
     # above the second. 0 and None: it does not.
@@ -277,7 +277,7 @@ class Scenario(Frozen):
 
     @property
     def privileged(self) -> bool:
-        """Whether observations are made from the true state."""
+        """Whether observations use the true state."""
         return self.estimator == "truth"
 
     @property
