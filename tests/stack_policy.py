@@ -1,7 +1,7 @@
 """The paper's whole stack on the policy's side: from the ``sensor`` observation to torques.
 
-It runs the same compiled laws as the on-board stack, on what a robot's sensors and radio say and on
-nothing else: the proof that the observation suffices. Use it with ``observation="sensor"``,
+It runs the same compiled laws as the on-board stack, on the readings of a robot's sensors and radio only,
+which shows that the observation suffices. Use it with ``observation="sensor"``,
 ``action="torque"`` and ``control_period_s=0.001``.
 """
 
@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tlf_env.numerics.compiled import driver
+from tlf_env.numerics.rows import reader, writer
 from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.estimator import (
     Ekf,
@@ -20,8 +21,6 @@ from tlf_env.onboard.estimator import (
     correct,
     ekf_constants,
     predict,
-    read_estimate,
-    write_estimate,
 )
 from tlf_env.onboard.observer import Message, observed_reference, observer_rates, smoothing
 from tlf_env.onboard.tracking import (
@@ -35,13 +34,10 @@ from tlf_env.onboard.wheel_loop import (
     WheelLoopRow,
     WheelLoopState,
     digital_wheel_loop,
-    read_loop_state,
     wheel_torque,
-    write_loop_state,
 )
-from tlf_env.physics.state import read_body
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
-from tlf_env.physics.vehicle import body_array, odometry, wheel_speeds
+from tlf_env.physics.vehicle import Body, body_array, odometry, wheel_speeds
 from tlf_env.task.actions import (
     ACTION_SIZE,
     FULL_SPEED_MM_S,
@@ -52,6 +48,9 @@ from tlf_env.task.observation import SAMPLE_ENTRIES, SensorTail, sensor_entries
 from tlf_env.task.scenario import Scenario
 
 SAMPLE = len(SAMPLE_ENTRIES)
+read_body = reader(Body)
+read_estimate, write_estimate = reader(Estimate), writer(Estimate)
+read_loop_state, write_loop_state = reader(WheelLoopState), writer(WheelLoopState)
 
 
 class StackState(NamedTuple):

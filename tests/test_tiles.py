@@ -17,7 +17,8 @@ from tlf_env.engine.sensors import disturbed_encoders, sense_robot
 from tlf_env.engine.settings import Settings, make_settings
 from tlf_env.engine.substeps import commanded_torques, floor_under, trace_drive, undisturbed
 from tlf_env.engine.tiles import WIDTH, advance
-from tlf_env.numerics.compiled import driver, reader, writer
+from tlf_env.numerics.compiled import driver
+from tlf_env.numerics.rows import reader, writer
 from tlf_env.physics.kernel import substep
 from tlf_env.physics.state import Push, advance_pose
 from tlf_env.task.actions import TWIST

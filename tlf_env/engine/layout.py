@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tlf_env.disturbances.channels import Effects
-from tlf_env.numerics.compiled import reader, row_reader, row_writer, writer
+from tlf_env.numerics.rows import reader, row_reader, row_writer, writer
 from tlf_env.onboard.estimator import Ekf, Estimate
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
 from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState

@@ -15,8 +15,9 @@ from tlf_env.engine.arrays import (
 )
 from tlf_env.engine.layout import Pose
 from tlf_env.engine.settings import Settings
-from tlf_env.numerics.compiled import law, slot_reader, slot_writer
+from tlf_env.numerics.compiled import law
 from tlf_env.numerics.philox import unit, words
+from tlf_env.numerics.rows import slot_reader, slot_writer
 from tlf_env.onboard.kinds import TRUTH
 from tlf_env.onboard.observer import (
     Message,

@@ -33,9 +33,9 @@ from tlf_env.engine.layout import Pose, in_array
 from tlf_env.engine.outlines import BODY_BEHIND, radii
 from tlf_env.engine.radio import broadcast, next_reference
 from tlf_env.engine.settings import Settings
-from tlf_env.numerics.compiled import block, law, writer
+from tlf_env.numerics.compiled import block, law
 from tlf_env.numerics.philox import normal_pair, unit, words
-from tlf_env.numerics.rows import replacing
+from tlf_env.numerics.rows import replacing, writer
 from tlf_env.onboard.estimator import Estimate
 from tlf_env.physics.vehicle import Mass, Motion, laden
 from tlf_env.task.measures import distance

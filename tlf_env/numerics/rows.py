@@ -1,4 +1,4 @@
-"""Compiled helpers for rows: named tuples of numbers."""
+"""Compiled access to rows: named tuples of numbers, in arrays, rings and tiles."""
 
 from __future__ import annotations
 
@@ -28,3 +28,53 @@ def replacing(row: type[Any], *names: str) -> Callable[..., Any]:
     scope: dict[str, Any] = {"_Row": row}
     exec(f"def replace(_old, {', '.join(names)}):\n    return _Row({fields})\n", scope)
     return law(scope["replace"])
+
+
+def reader(row: type[Any], first: int = 0) -> Callable[..., Any]:
+    """Compiled ``read(array, robot, lane)``: a named tuple from ``array[first + field, robot, lane]``."""
+    fields = ", ".join(f"a[{first + i}, r, l]" for i in range(len(row._fields)))
+    scope: dict[str, Any] = {"Row": row}
+    exec(f"def read(a, r, l):\n    return Row({fields})\n", scope)
+    return law(scope["read"])
+
+
+def writer(row: type[Any], first: int = 0) -> Callable[..., Any]:
+    """Compiled ``write(array, robot, lane, row)``, the inverse of :func:`reader`."""
+    lines = "\n".join(
+        f"    a[{first + i}, r, l] = row.{name}" for i, name in enumerate(row._fields)
+    )
+    scope: dict[str, Any] = {}
+    exec(f"def write(a, r, l, row):\n{lines}\n", scope)
+    return law(scope["write"])
+
+
+def slot_reader(row: type[Any]) -> Callable[..., Any]:
+    """Compiled ``read(ring, slot, robot, lane)`` that gathers a named tuple from a ring of them."""
+    fields = ", ".join(f"a[{i}, k, r, l]" for i in range(len(row._fields)))
+    scope: dict[str, Any] = {"Row": row}
+    exec(f"def read(a, k, r, l):\n    return Row({fields})\n", scope)
+    return law(scope["read"])
+
+
+def slot_writer(row: type[Any]) -> Callable[..., Any]:
+    """Compiled ``write(ring, slot, robot, lane, row)``, the inverse of :func:`slot_reader`."""
+    lines = "\n".join(f"    a[{i}, k, r, l] = row.{name}" for i, name in enumerate(row._fields))
+    scope: dict[str, Any] = {}
+    exec(f"def write(a, k, r, l, row):\n{lines}\n", scope)
+    return law(scope["write"])
+
+
+def row_reader(row: type[Any], first: int) -> Callable[..., Any]:
+    """Compiled ``read(tile, i)`` that gathers a named tuple from ``tile[first + field, i]``."""
+    fields = ", ".join(f"t[{first + i}, i]" for i in range(len(row._fields)))
+    scope: dict[str, Any] = {"Row": row}
+    exec(f"def read(t, i):\n    return Row({fields})\n", scope)
+    return law(scope["read"])
+
+
+def row_writer(row: type[Any], first: int) -> Callable[..., Any]:
+    """Compiled ``write(tile, i, row)``, the inverse of :func:`row_reader`."""
+    lines = "\n".join(f"    t[{first + i}, i] = row.{name}" for i, name in enumerate(row._fields))
+    scope: dict[str, Any] = {}
+    exec(f"def write(t, i, row):\n{lines}\n", scope)
+    return law(scope["write"])

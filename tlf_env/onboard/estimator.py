@@ -9,7 +9,7 @@ from __future__ import annotations
 from typing import NamedTuple
 
 from tlf_env.common.models import Frozen, NonNegative, Positive
-from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.compiled import law
 from tlf_env.numerics.trig import sincos
 
 
@@ -56,11 +56,6 @@ class PoseGain(NamedTuple):
     yy: float
     tx: float
     ty: float
-
-
-read_ekf = reader(Ekf)
-read_estimate = reader(Estimate)
-write_estimate = writer(Estimate)
 
 
 def ekf_constants(parameters: EkfParameters) -> Ekf:

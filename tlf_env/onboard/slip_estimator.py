@@ -21,7 +21,7 @@ import math
 from typing import NamedTuple
 
 from tlf_env.common.models import Frozen, NonNegative, Positive, infinite_if_none
-from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.compiled import law
 from tlf_env.numerics.rows import replacing
 from tlf_env.numerics.trig import sincos
 from tlf_env.onboard.estimator import (
@@ -126,11 +126,6 @@ class SlipEstimate(NamedTuple):
     spin_2: float
     roughness_1: float  # mean square of their usual changes, mostly encoder noise
     roughness_2: float
-
-
-read_slip_ekf = reader(SlipEkf)
-read_slip_estimate = reader(SlipEstimate)
-write_slip_estimate = writer(SlipEstimate)
 
 
 def sample_weight(dt_s: float, time_s: float) -> float:

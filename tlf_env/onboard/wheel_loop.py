@@ -11,7 +11,7 @@ import math
 from typing import NamedTuple
 
 from tlf_env.common.models import Frozen, Positive
-from tlf_env.numerics.compiled import law, reader, writer
+from tlf_env.numerics.compiled import law
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
 
@@ -40,11 +40,6 @@ class WheelLoopState(NamedTuple):
     lag_l: float
     integral_r: float
     lag_r: float
-
-
-read_wheel_loop = reader(WheelLoopRow)
-read_loop_state = reader(WheelLoopState)
-write_loop_state = writer(WheelLoopState)
 
 
 def digital_wheel_loop(parameters: WheelLoopParameters, dt_s: float) -> WheelLoopRow:

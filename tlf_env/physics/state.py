@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-from tlf_env.numerics.compiled import law, reader, writer
-from tlf_env.numerics.rows import replacing
+from tlf_env.numerics.compiled import law
+from tlf_env.numerics.rows import reader, replacing, writer
 from tlf_env.numerics.trig import sincos
 from tlf_env.physics.parameters import Body
 
