@@ -4,20 +4,16 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Iterable, Mapping, Sequence
-from pathlib import Path
 from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from tlf_env.engine.batch import BatchPlant
+from tlf_env.engine.batch import BatchPlant, Source
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.info import END_REASONS
 from tlf_env.task.observation import OBSERVATION_LIMIT
-from tlf_env.task.scenario import Scenario
-
-Source = str | Path | Mapping[str, Any] | Scenario
 
 
 class Place(NamedTuple):

@@ -13,11 +13,11 @@ from baselines import ReferencePolicy
 from tlf_env.common.presets import preset_names, presets_folder
 from tlf_env.disturbances.channels import (
     CHANNELS,
+    CONTROL_STEP,
     EPISODE,
     NOMINAL_NOISE_MM,
     PATHS,
     SET_WITHIN_EPISODE,
-    STEP,
     SUBSTEP,
     number,
     numbers,
@@ -263,7 +263,7 @@ def test_channels_and_robots_draw_independently():
     random = {path: random_signal(path) for path in SET_WITHIN_EPISODE}
     applied = run(random, seconds=20.0).applied[::5]  # one row per draw
     scale = [SHOWS[path] - CHANNELS[number(path)].nominal for path in SET_WITHIN_EPISODE]
-    within = numbers(SUBSTEP, STEP)
+    within = numbers(SUBSTEP, CONTROL_STEP)
     draws = (applied[:, :, within] - applied[:1, :, within].mean()) / scale
     columns = draws.reshape(len(draws), -1).T
     alike = np.corrcoef(columns) - np.eye(len(columns))

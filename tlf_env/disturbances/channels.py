@@ -18,9 +18,9 @@ RADIO_JITTER = 4
 RADIO_DROPOUT = 5
 MIXTURE = 6
 
-Rate = Literal["substep", "step", "episode"]
+Rate = Literal["substep", "control step", "episode"]
 SUBSTEP: Rate = "substep"  # acts in the plant and the sensors, so it is evaluated in every substep
-STEP: Rate = "step"  # evaluated once per control step
+CONTROL_STEP: Rate = "control step"  # evaluated once per control step
 EPISODE: Rate = "episode"  # evaluated once, at the start
 
 
@@ -51,10 +51,10 @@ CHANNELS = (
     Channel("encoder.quantum_rad", 107, SUBSTEP, 0.0, 0.0, 1.0, "resolution of the encoders"),
     Channel("actuator.torque_gain_l", 108, SUBSTEP, 1.0, 0.0, 10.0, "delivered over commanded torque, left"),
     Channel("actuator.torque_gain_r", 109, SUBSTEP, 1.0, 0.0, 10.0, "delivered over commanded torque, right"),
-    Channel("actuator.dead_time_s", 110, STEP, 0.0, 0.0, 0.1, "delay from wheel loop to torque"),
-    Channel("actuator.computing_delay_s", 111, STEP, 0.0, 0.0, 1.0, "delay from action to wheel loops"),
-    Channel("radio.jitter_s", 112, STEP, 0.0, 0.0, 10.0, "largest extra age of a message"),
-    Channel("radio.dropout", 113, STEP, 0.0, 0.0, 0.999, "share of messages that never arrive"),
+    Channel("actuator.dead_time_s", 110, CONTROL_STEP, 0.0, 0.0, 0.1, "delay from wheel loop to torque"),
+    Channel("actuator.computing_delay_s", 111, CONTROL_STEP, 0.0, 0.0, 1.0, "delay from action to wheel loops"),
+    Channel("radio.jitter_s", 112, CONTROL_STEP, 0.0, 0.0, 10.0, "largest extra age of a message"),
+    Channel("radio.dropout", 113, CONTROL_STEP, 0.0, 0.0, 0.999, "share of messages that never arrive"),
     Channel("payload.mass_kg", 114, EPISODE, 0.0, 0.0, 100.0, "mass put on the chassis"),
     Channel("payload.behind_mm", 115, EPISODE, 0.0, -200.0, 200.0, "its distance behind the axle's midpoint"),
     Channel("payload.inertia_kg_mm2", 116, EPISODE, 0.0, 0.0, 1e7, "its inertia about its own centre"),

@@ -7,8 +7,8 @@ import numpy as np
 from tlf_env.disturbances.channels import (
     CHANNELS,
     COMPUTING_DELAY,
+    CONTROL_STEP,
     DEAD_TIME,
-    STEP,
     SUBSTEP,
     numbers,
 )
@@ -21,7 +21,10 @@ STREAMS = np.array([channel.stream for channel in CHANNELS])
 NOMINALS = np.array([channel.nominal for channel in CHANNELS])
 LOWS = np.array([channel.low for channel in CHANNELS])
 HIGHS = np.array([channel.high for channel in CHANNELS])
-OF_SUBSTEPS, OF_STEPS = numbers(SUBSTEP), numbers(STEP)  # places of the channels by their rate
+OF_SUBSTEPS, OF_STEPS = (
+    numbers(SUBSTEP),
+    numbers(CONTROL_STEP),
+)  # places of the channels by their rate
 
 
 @block

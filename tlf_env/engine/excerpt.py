@@ -25,7 +25,7 @@ class Excerpt(NamedTuple):
 TERMS_ROW = len(Info._fields)
 APPLIED_ROW = TERMS_ROW + len(RewardTerms._fields)
 REWARD_ROW = APPLIED_ROW + len(CHANNELS)
-LOST_ROW, TOUCHED_ROW, END_ROW, ROWS = range(REWARD_ROW + 1, REWARD_ROW + 5)
+LOST_ROW, TOUCHED_ROW, END_ROW, EXCERPT_ROWS = range(REWARD_ROW + 1, REWARD_ROW + 5)
 
 
 def empty_excerpt(arrays: Arrays, robot: int, lanes: int) -> Excerpt:
@@ -35,7 +35,7 @@ def empty_excerpt(arrays: Arrays, robot: int, lanes: int) -> Excerpt:
         if arrays.sensor_observations.shape[2] > 0
         else arrays.observations
     )
-    numbers = np.empty((ROWS, padded(lanes)))
+    numbers = np.empty((EXCERPT_ROWS, padded(lanes)))
     return Excerpt(robot, numbers, np.empty((lanes, shown.shape[2]), dtype=shown.dtype))
 
 
