@@ -190,7 +190,7 @@ def test_robots_that_part_are_still_pushed_out_of_their_last_overlap():
 
 def test_a_rebuilt_space_repeats_a_collision_bit_for_bit():
     a, b = meet(head_on(20.0), 0.5), meet(head_on(20.0), 0.5)
-    assert np.array_equal(a.rows("motion"), b.rows("motion"))
+    assert np.array_equal(a.motions, b.motions)
 
 
 def test_a_reset_plant_has_forgotten_its_contacts():

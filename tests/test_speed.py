@@ -77,7 +77,7 @@ def test_formations_are_put_where_the_recorded_ones_stood(moments):
         recorded = moments.arrays[number]
         assert np.array_equal(infos, recorded.infos[moments.lanes])
         here = plant.arrays.rows("motion")[:, :, number * count : (number + 1) * count]
-        assert np.array_equal(here, recorded.motions[:, :, moments.lanes])
+        assert np.array_equal(here, recorded.rows("motion")[:, :, moments.lanes])
 
 
 def test_recorded_actions_go_on_where_the_reference_went(moments):
