@@ -66,3 +66,34 @@ def test_an_import_inside_a_function_counts_too():
                 assert not (node.module or "").startswith("baselines"), path
             if isinstance(node, ast.Import):
                 assert not any(name.name.startswith("baselines") for name in node.names), path
+
+
+MOST_BY_PLACE = 6  # fields of a named tuple that may be given by place
+
+
+def long_tuples() -> dict[str, int]:
+    """Named tuples of the sources with more fields than may be given by place."""
+    found = {}
+    for folder in ("tlf_env", "baselines"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                bases = getattr(node, "bases", [])
+                if any(isinstance(base, ast.Name) and base.id == "NamedTuple" for base in bases):
+                    fields = sum(isinstance(item, ast.AnnAssign) for item in node.body)
+                    if fields > MOST_BY_PLACE:
+                        found[node.name] = fields
+    return found
+
+
+def test_long_named_tuples_are_made_by_keyword():
+    tuples = long_tuples()
+    assert {"Body", "Motion", "Contact", "Estimate", "SlipEstimate", "Tracking", "Info"} <= set(
+        tuples
+    )
+    for folder in ("tlf_env", "baselines"):
+        for path in (ROOT / folder).rglob("*.py"):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name):
+                    plain = [one for one in node.args if not isinstance(one, ast.Starred)]
+                    if node.func.id in tuples:
+                        assert not plain, f"{path}:{node.lineno}: {node.func.id} by place"

@@ -223,7 +223,7 @@ def test_a_new_field_of_a_nested_model_changes_no_hash(monkeypatch):
 
 def test_a_new_channel_needs_no_entry(monkeypatch):
     before = scenario_hash(load_scenario(ROUND))
-    gust = Channel("slip.gust_mm_s", 999, "substep", 2.0, 0.0, 9.0, "a gust")
+    gust = Channel("slip.gust_mm_s", 999, "substep", 2.0, (0.0, 9.0), "a gust")
     monkeypatch.setattr(neutral, "CHANNELS", (*CHANNELS, gust))
     assert "slip.gust_mm_s" not in channels.PATHS
     group = create_model(

@@ -35,31 +35,40 @@ class Channel(NamedTuple):
     stream: int  # of its random numbers
     rate: Rate
     nominal: float
-    low: float  # smallest and largest value allowed
-    high: float
+    limits: tuple[float, float]  # smallest and largest value allowed
     meaning: str
+
+    @property
+    def low(self) -> float:
+        """The smallest value allowed."""
+        return self.limits[0]
+
+    @property
+    def high(self) -> float:
+        """The largest value allowed."""
+        return self.limits[1]
 
 
 CHANNELS = (
-    Channel("slip.delta_1_mm_s", 100, SUBSTEP, 0.0, -2000.0, 2000.0, "slip δ₁ of eq. (14), both drive wheels"),
-    Channel("slip.delta_2_rad_s", 101, SUBSTEP, 0.0, -20.0, 20.0, "slip δ₂ of eq. (14)"),
-    Channel("tyre.friction_scale", 102, SUBSTEP, 1.0, 0.0, 100.0, "factor on the friction of all tyres"),
-    Channel("position.bias_x_mm", 103, SUBSTEP, 0.0, -1e4, 1e4, "offset of the position fixes, x"),
-    Channel("position.bias_y_mm", 104, SUBSTEP, 0.0, -1e4, 1e4, "offset of the position fixes, y"),
-    Channel("position.noise_std_mm", 105, SUBSTEP, NOMINAL_NOISE_MM, 0.0, 1e3, "white noise of a fix"),
-    Channel("encoder.noise_std_rad", 106, SUBSTEP, 0.0, 0.0, 1.0, "white noise of each encoder reading"),
-    Channel("encoder.quantum_rad", 107, SUBSTEP, 0.0, 0.0, 1.0, "resolution of the encoders"),
-    Channel("actuator.torque_gain_l", 108, SUBSTEP, 1.0, 0.0, 10.0, "delivered over commanded torque, left"),
-    Channel("actuator.torque_gain_r", 109, SUBSTEP, 1.0, 0.0, 10.0, "delivered over commanded torque, right"),
-    Channel("actuator.dead_time_s", 110, CONTROL_STEP, 0.0, 0.0, 0.1, "delay from wheel loop to torque"),
-    Channel("actuator.computing_delay_s", 111, CONTROL_STEP, 0.0, 0.0, 1.0, "delay from action to wheel loops"),
-    Channel("radio.jitter_s", 112, CONTROL_STEP, 0.0, 0.0, 10.0, "largest extra age of a message"),
-    Channel("radio.dropout", 113, CONTROL_STEP, 0.0, 0.0, 0.999, "share of messages that never arrive"),
-    Channel("payload.mass_kg", 114, EPISODE, 0.0, 0.0, 100.0, "mass put on the chassis"),
-    Channel("payload.behind_mm", 115, EPISODE, 0.0, -200.0, 200.0, "its distance behind the axle's midpoint"),
-    Channel("payload.inertia_kg_mm2", 116, EPISODE, 0.0, 0.0, 1e7, "its inertia about its own centre"),
-    Channel("start.position_std_mm", 117, EPISODE, 0.0, 0.0, 1e4, "scatter of the starts, per coordinate"),
-    Channel("start.heading_std_rad", 118, EPISODE, 0.0, 0.0, 10.0, "scatter of the start headings"),
+    Channel("slip.delta_1_mm_s", 100, SUBSTEP, 0.0, (-2000.0, 2000.0), "slip δ₁ of eq. (14), both wheels"),
+    Channel("slip.delta_2_rad_s", 101, SUBSTEP, 0.0, (-20.0, 20.0), "slip δ₂ of eq. (14)"),
+    Channel("tyre.friction_scale", 102, SUBSTEP, 1.0, (0.0, 100.0), "factor on the friction of all tyres"),
+    Channel("position.bias_x_mm", 103, SUBSTEP, 0.0, (-1e4, 1e4), "offset of the position fixes, x"),
+    Channel("position.bias_y_mm", 104, SUBSTEP, 0.0, (-1e4, 1e4), "offset of the position fixes, y"),
+    Channel("position.noise_std_mm", 105, SUBSTEP, NOMINAL_NOISE_MM, (0.0, 1e3), "white noise of a fix"),
+    Channel("encoder.noise_std_rad", 106, SUBSTEP, 0.0, (0.0, 1.0), "white noise of each encoder reading"),
+    Channel("encoder.quantum_rad", 107, SUBSTEP, 0.0, (0.0, 1.0), "resolution of the encoders"),
+    Channel("actuator.torque_gain_l", 108, SUBSTEP, 1.0, (0.0, 10.0), "delivered/commanded torque, left"),
+    Channel("actuator.torque_gain_r", 109, SUBSTEP, 1.0, (0.0, 10.0), "delivered/commanded torque, right"),
+    Channel("actuator.dead_time_s", 110, CONTROL_STEP, 0.0, (0.0, 0.1), "from wheel loop to torque"),
+    Channel("actuator.computing_delay_s", 111, CONTROL_STEP, 0.0, (0.0, 1.0), "from action to wheel loop"),
+    Channel("radio.jitter_s", 112, CONTROL_STEP, 0.0, (0.0, 10.0), "largest extra age of a message"),
+    Channel("radio.dropout", 113, CONTROL_STEP, 0.0, (0.0, 0.999), "share of messages that never arrive"),
+    Channel("payload.mass_kg", 114, EPISODE, 0.0, (0.0, 100.0), "mass put on the chassis"),
+    Channel("payload.behind_mm", 115, EPISODE, 0.0, (-200.0, 200.0), "its distance behind the axle's midpoint"),
+    Channel("payload.inertia_kg_mm2", 116, EPISODE, 0.0, (0.0, 1e7), "its inertia about its own centre"),
+    Channel("start.position_std_mm", 117, EPISODE, 0.0, (0.0, 1e4), "scatter of the starts, per coordinate"),
+    Channel("start.heading_std_rad", 118, EPISODE, 0.0, (0.0, 10.0), "scatter of the start headings"),
 )  # fmt: skip
 
 
