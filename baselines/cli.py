@@ -219,6 +219,8 @@ def speed(
     from baselines.tables import speed_table
 
     counts = [] if formations == "none" else whole_numbers("formations", formations)
+    if out is not None:
+        writable_folder(out.parent)
     warn_of_compiling()
     with progress_bar("speed") as update:
         result = measure(
@@ -295,7 +297,8 @@ def bench(
     plan: Annotated[
         str | None,
         typer.Option(
-            help="Take the options above from a plan, board or FILE.yaml; command-line options take "
+            help="Read policies, tasks, disturbances, seeds, level, sweep, horizon and plant from a plan: "
+            "board, unseen or FILE.yaml; command-line options take "
             "precedence.",
             is_eager=True,
             callback=take_plan,

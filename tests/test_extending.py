@@ -15,7 +15,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = ROOT / "docs" / "extending.md"
 BLOCK = re.compile(
-    r"^<!-- edit: (\S+) (new|(?:after|before|replace): (.+?)) -->\n```\w+\n(.*?)^```$", re.M | re.S
+    r"^`([^`]+)`(?:, (after|before|in place of) the line `([^\n]+)`| (\(a new file\))):\n\n"
+    r"```\w+\n(.*?)^```$",
+    re.M | re.S,
 )
 
 
@@ -24,21 +26,21 @@ class Edit(NamedTuple):
 
     section: str
     path: str
-    how: str  # new, after, before or replace
+    how: str  # after, before, in place of; or empty for a new file
     line: str  # the line that it refers to begins so
     text: str
 
     def apply(self, root: Path) -> None:
         place = root / self.path
-        if self.how == "new":
+        if not self.how:
             assert not place.exists()
             place.write_text(self.text, encoding="utf-8")
             return
         lines = place.read_text(encoding="utf-8").splitlines(keepends=True)
-        found = [i for i, line in enumerate(lines) if line.startswith(self.line)]
+        found = [i for i, line in enumerate(lines) if line.strip().startswith(self.line)]
         assert len(found) == 1, f"{self.path}: {self.line!r} is there {len(found)} times"
         first = found[0] + (self.how == "after")
-        lines[first : first + (self.how == "replace")] = [self.text]
+        lines[first : first + (self.how == "in place of")] = [self.text]
         place.write_text("".join(lines), encoding="utf-8")
 
 
@@ -46,8 +48,8 @@ def edits() -> list[Edit]:
     """All blocks in the order of the page."""
     found = []
     for section in re.split(r"^## ", PAGE.read_text(encoding="utf-8"), flags=re.M)[1:]:
-        for path, how, line, text in BLOCK.findall(section):
-            found.append(Edit(section.split("\n")[0], path, how.split(":")[0], line, text))
+        for path, how, line, _, text in BLOCK.findall(section):
+            found.append(Edit(section.split("\n")[0], path, how, line, text))
     return found
 
 
@@ -60,7 +62,7 @@ def of(section: str) -> list[Edit]:
 
 def test_every_block_of_code_is_an_edit():
     text = PAGE.read_text(encoding="utf-8")
-    assert len(EDITS) == text.count("<!-- edit:") == text.count("\n```") // 2
+    assert len(EDITS) == text.count("\n```") // 2
 
 
 def test_a_channel_takes_at_most_three_files_and_twelve_lines():

@@ -25,7 +25,7 @@ EPISODE: Rate = "episode"  # evaluated once, at the start
 
 
 class Channel(NamedTuple):
-    """One channel. The places in :data:`CHANNELS` are free; path, stream and nominal value never change.
+    """One channel. The order of :data:`CHANNELS` is free; path, stream and nominal value never change.
 
     The nominal value is the one without a disturbance. A recorded result counts it as absent, so a
     channel may be added at any time without changing what older results are compared by.

@@ -1,6 +1,6 @@
 """The table of channels in the documentation, made from the channels.
 
-``python -m tlf_env.disturbances.table docs/disturbances.md`` writes it anew between its markers.
+``python -m tlf_env.disturbances.table docs/disturbances.md`` updates it between its markers.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def table() -> str:
 
 
 def renewed(page: str) -> str:
-    """A page with the table between its markers made anew.
+    """A page with the table between its markers updated.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""The arrays that an episode remembers: constants, states, rings over time, and what interfaces read."""
+"""The arrays of an episode: constants, states, rings over time, and the results that interfaces read."""
 
 from __future__ import annotations
 
@@ -110,16 +110,14 @@ class Arrays(NamedTuple):
         return ring[:, step % ring.shape[1], :, : len(self.seeds)]
 
 
-read_body, write_body = array_reader("body"), array_writer("body")
+read_body = array_reader("body")
 read_motion, write_motion = array_reader("motion"), array_writer("motion")
 read_estimate, write_estimate = array_reader("estimate"), array_writer("estimate")
 read_slip = array_reader("slip")
 read_trace = array_reader("trace")
 read_wanted, write_wanted = array_reader("wanted"), array_writer("wanted")
-read_wanted_before, write_wanted_before = (
-    array_reader("wanted_before"),
-    array_writer("wanted_before"),
-)
+read_wanted_before = array_reader("wanted_before")
+write_wanted_before = array_writer("wanted_before")
 read_command, write_command = array_reader("command"), array_writer("command")
 read_observer, write_observer = array_reader("observer"), array_writer("observer")
 read_start, write_start = array_reader("start"), array_writer("start")

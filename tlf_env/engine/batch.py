@@ -52,7 +52,7 @@ class BatchPlant:
     Raises
     ------
     ValueError
-        for a scenario that cannot run in a batch (parts of one's own, ``adversary``), scenarios that
+        for a scenario that cannot run in a batch (user-defined parts, ``adversary``), scenarios that
         differ elsewhere, or a number out of range; naming the field.
     """
 
@@ -221,7 +221,7 @@ class BatchPlant:
 
     @property
     def infos(self) -> np.ndarray:
-        """(formations, robots, :class:`~tlf_env.engine.layout.Info`)."""
+        """(formations, robots, :class:`~tlf_env.task.info.Info`)."""
         return self.arrays.infos
 
     @property
@@ -290,12 +290,12 @@ class BatchPlant:
         return self.arrays.variants
 
     def state(self) -> np.ndarray:
-        """The truth, (formations, robots, :class:`~tlf_env.engine.layout.State`), in physical units."""
+        """The truth, (formations, robots, :class:`~tlf_env.task.info.State`), in physical units."""
         return readout.state_rows(self.arrays)
 
     @property
     def memory_per_formation_bytes(self) -> int:
-        """What one formation more costs."""
+        """Bytes per additional formation."""
         one, two = (
             sum(array.nbytes for array in make_arrays(self.scenarios, self.arrays.table, lanes))
             for lanes in (1, 2)

@@ -21,10 +21,8 @@ STREAMS = np.array([channel.stream for channel in CHANNELS])
 NOMINALS = np.array([channel.nominal for channel in CHANNELS])
 LOWS = np.array([channel.low for channel in CHANNELS])
 HIGHS = np.array([channel.high for channel in CHANNELS])
-OF_SUBSTEPS, OF_STEPS = (
-    numbers(SUBSTEP),
-    numbers(CONTROL_STEP),
-)  # places of the channels by their rate
+# Places of the channels by their rate.
+OF_SUBSTEPS, OF_STEPS = numbers(SUBSTEP), numbers(CONTROL_STEP)
 
 
 @block
@@ -65,7 +63,7 @@ def refresh(
     ticks: int,
     settings: Settings,
 ) -> bool:
-    """Evaluate those of some channels that may have changed since ``ticks`` ago; whether there were any."""
+    """Evaluate the given channels that may have changed in the last ``ticks``; return whether any may have."""
     found = False
     for i in range(channels.shape[0]):
         c = channels[i]

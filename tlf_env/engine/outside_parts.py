@@ -48,7 +48,7 @@ class Parts:
         self._made: dict[str, list[Any]] = {}
 
     def reset(self, arrays: Arrays, settings: Settings) -> None:
-        """Make all parts anew and start them; observers run ahead by the preview.
+        """Make all parts again and start them; observers run ahead by the preview.
 
         Raises
         ------

@@ -59,7 +59,7 @@ def clear(array: np.ndarray, lane: int, first: int, last: int) -> None:
 
 @block
 def clear_lane(arrays: Arrays, lane: int) -> None:
-    """Forget the last episode; arrays that are not cleared here are written before they are read."""
+    """Clear a lane for a new episode; arrays that are not cleared here are written before they are read."""
     clear(arrays.states, lane, 0, arrays.states.shape[0])
     clear(arrays.processes, lane, 0, arrays.processes.shape[0])
     for robot in range(arrays.states.shape[1]):
@@ -97,7 +97,7 @@ def take_variant(arrays: Arrays, of: Variants, lane: int) -> None:
 
 @block
 def load_robot(arrays: Arrays, lane: int, robot: int) -> bool:
-    """Put the payload on; whether the wheels can carry it."""
+    """Add the payload; return whether the wheels can carry it."""
     mass = arrays.applied[PAYLOAD_MASS, robot, lane]
     if mass <= 0.0:
         return True

@@ -14,9 +14,8 @@ from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState, wheel_torqu
 from tlf_env.physics.vehicle import Body, Contact, Floor, Motion, conveyor
 from tlf_env.task.actions import TORQUE
 
-EXTERNAL_TORQUE = (
-    4  # replaces the kind of action of a robot whose wheel loop is an object in Python
-)
+# Replaces the kind of action of a robot whose wheel loop is an object in Python.
+EXTERNAL_TORQUE = 4
 
 with_drive_sums = replacing(
     Trace, "torque_l", "torque_r", "saturated", "slip", "slid", "torque_2", "work"

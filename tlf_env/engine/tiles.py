@@ -176,7 +176,7 @@ def change_effects(arrays: Arrays, tile: np.ndarray, count: int, settings: Setti
 
 @block
 def delay_torques(torques: np.ndarray, tile: np.ndarray, count: int) -> None:
-    """Deliver the torques asked for one dead time ago; ``torques`` is their ring."""
+    """Deliver the torques commanded one dead time ago; ``torques`` is their ring."""
     slots, lanes = torques.shape[1], torques.shape[3]
     for i in range(count):
         draw, column = draw_of(whole(tile), i), whole(tile)[COLUMN, i]

@@ -27,7 +27,8 @@ T = TypeVar("T", bound=type)
 
 def table(header: tuple[str, ...], rows: Sequence[tuple[str, ...]]) -> str:
     """A Markdown table."""
-    lines = [header, tuple("---" for _ in header), *rows]
+    cells = [tuple(cell.replace("|", "\\|") for cell in row) for row in rows]
+    lines = [header, tuple("---" for _ in header), *cells]
     return "\n".join("| " + " | ".join(line) + " |" for line in lines)
 
 

@@ -27,9 +27,9 @@ class RewardTerms(NamedTuple):
 
 REWARD_MEANINGS = {
     "far": "e/1000 mm, e the true position error to the robot's own reference",
-    "coarse": "e^(−e/100 mm)",
-    "medium": "e^(−e/10 mm)",
-    "fine": "e^(−e/2 mm)",
+    "coarse": "exp(−e/100 mm)",
+    "medium": "exp(−e/10 mm)",
+    "fine": "exp(−e/2 mm)",
     "action_change": "|Δa|², a in units of the action space",
     "action_size": "|a|²",
     "slip": "largest slip speed of a drive wheel in the step, in 100 mm/s",

@@ -192,12 +192,11 @@ class Scenario(Frozen):
                     f"{name} {getattr(self, name)} is more than {MAX_STEPS} steps of "
                     f"physics_period_s {self.physics_period_s}"
                 )
-        for name in ("control_period_s",):
-            if whole_steps(getattr(self, name), self.physics_period_s) in (None, 0):
-                raise ValueError(
-                    f"{name} {getattr(self, name)} must be a multiple of physics_period_s "
-                    f"{self.physics_period_s}"
-                )
+        if whole_steps(self.control_period_s, self.physics_period_s) in (None, 0):
+            raise ValueError(
+                f"control_period_s {self.control_period_s} must be a multiple of physics_period_s "
+                f"{self.physics_period_s}"
+            )
         for name in ("time_gap_s", "horizon_s"):
             if whole_steps(getattr(self, name), self.control_period_s) in (None, 0):
                 raise ValueError(
@@ -251,7 +250,7 @@ class Scenario(Frozen):
         for role, path in self.part_paths.items():
             raise ValueError(f"{role} {path!r} is a Python object, which cannot run in a batch")
         if self.adversary:
-            raise ValueError("adversary True: a caller cannot set channels in a batch")
+            raise ValueError("adversary True cannot be used with plant 'batch'")
 
     @property
     def robot_count(self) -> int:
