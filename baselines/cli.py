@@ -426,7 +426,9 @@ def tune(
     ] = None,
     workers: Annotated[
         int,
-        typer.Option(help="Processes on this machine; 0: one per core. Only 1 repeats exactly."),
+        typer.Option(
+            help="Processes on this machine; 0: one per core. Results are reproducible with 1 only."
+        ),
     ] = 1,
     ray: Annotated[
         str | None, typer.Option(help="Address of an existing Ray cluster to run on instead.")

@@ -286,7 +286,7 @@ def test_only_numbers_that_exist_can_be_swept():
     for path, said in (
         ("x", "no 'x'; there are a, c"),
         ("a.x", "no 'x'"),
-        ("c.d", "'c' has no parts"),
+        ("c.d", "'c' is a value, not a group"),
     ):
         with pytest.raises(ValueError, match=said):
             with_value(tree, path, 5)

@@ -30,5 +30,5 @@ def with_value(tree: dict[str, Any], path: str, value: float) -> dict[str, Any]:
     if head not in tree:
         raise ValueError(f"there is no {head!r}; there are {', '.join(sorted(tree))}")
     if tail and not isinstance(tree[head], dict):
-        raise ValueError(f"{head!r} has no parts, got {path!r}")
+        raise ValueError(f"{head!r} is a value, not a group, got {path!r}")
     return {**tree, head: with_value(tree[head], tail, value) if tail else value}
