@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import typer
 
-import tlf_env  # noqa: F401  registers the environments
+import tlf_env  # noqa: F401 importing it registers the environments with Gymnasium
 
 
 def episode_return(env: gymnasium.Env, *, random: bool, seed: int) -> tuple[float, str]:

@@ -242,7 +242,7 @@ class StackPolicy:
         ------
         ValueError
             if the observation is not a ``sensor`` observation of the scenario, or unlike robots
-            cannot be told apart by the number of rows.
+            cannot be distinguished by the number of rows.
         """
         observation = np.asarray(observation)
         if observation.ndim not in (1, 2) or observation.shape[-1] != len(self._scales):

@@ -76,7 +76,10 @@ def test_the_intervals_of_a_mean_agree_with_all_resamples():
 
 def test_a_stratified_interval_resamples_each_stratum_by_itself():
     strata = [np.zeros(5), np.full(5, 100.0)]
-    mean = lambda *parts: float(np.mean(np.concatenate(parts)))  # noqa: E731  a statistic for one use
+
+    def mean(*parts: np.ndarray) -> float:
+        return float(np.mean(np.concatenate(parts)))
+
     assert statistics.stratified_interval(strata, mean) == [50, 50]
     low, high = statistics.interval(np.concatenate(strata), lambda x: float(np.mean(x)))
     assert high - low > 30

@@ -199,9 +199,9 @@ def test_ends_are_those_of_the_environment(end_on):
             observations, _, ended, cut, infos = env.step(dict(zip(agents, rows, strict=True)))
             assert list(ended.values()) == terminated[k].tolist()
             assert list(cut.values()) == truncated[k].tolist()
-            told = [infos[agent].get("end", "") for agent in agents]
-            assert told == [END_REASONS[end] for end in ends[k]]
-            reasons |= set(told)
+            ends_by_agent = [infos[agent].get("end", "") for agent in agents]
+            assert ends_by_agent == [END_REASONS[end] for end in ends[k]]
+            reasons |= set(ends_by_agent)
             if not env.agents:
                 break
         assert not env.agents

@@ -350,9 +350,9 @@ def test_bad_input_is_one_line_and_writes_nothing(words, said, tmp_path, monkeyp
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 2
-    told = capsys.readouterr().err
-    assert "\n" not in told.strip()
-    assert said in told
+    shown = capsys.readouterr().err
+    assert "\n" not in shown.strip()
+    assert said in shown
     assert not list((tmp_path / "out").glob("*"))
 
 

@@ -69,7 +69,7 @@ def test_flower_at_20_ms_for_more_seeds():
         assert run.rms_mm.max() <= 1.5
 
 
-# The target is every seed. A miss stands here as a miss: the bound is the same for it.
+# The target is that every seed meets the bound. Seed 15 misses it; the bound is not loosened for it.
 SKIDS_WHILE_CATCHING_UP = pytest.mark.xfail(
     strict=True,
     reason="robot_2 skids while it catches up, and its filter, which assumes no slip, loses the heading",

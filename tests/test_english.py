@@ -34,8 +34,9 @@ PATTERNS = {
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 SOURCES = sorted(
     path
-    for folder in ("tlf_env", "baselines", "examples", "docs/figures")
+    for folder in ("tlf_env", "baselines", "examples", "docs/figures", "tests")
     for path in (ROOT / folder).rglob("*.py")
+    if path != Path(__file__).resolve()  # which quotes what it looks for
 )
 YAMLS = sorted((ROOT / "configs").rglob("*.yaml"))
 

@@ -295,8 +295,8 @@ def nominal():
 
 
 OVERSTATED = (
-    "α₃ = 1e-2 rad/mm of eq. (36) is far above the error of noiseless encoders: the filter corrects its "
-    "heading more than it should"
+    "the printed α₃ = 1e-2 rad/mm of eq. (36) is far above the error of noiseless encoders, so the filter "
+    "over-corrects its heading; a consistent filter would pass"
 )
 
 
@@ -305,7 +305,7 @@ def test_heading_error_on_the_nominal_infinity(nominal):
     assert 0.006 < rms < 0.02
 
 
-def test_filter_doubts_its_heading_more_than_it_need(nominal):
+def test_heading_variance_is_larger_than_the_squared_error(nominal):
     errors, variances = nominal.heading_error, nominal.heading_variance
     assert np.mean(errors[nominal.settled] ** 2) < np.mean(variances[nominal.settled])
 

@@ -416,7 +416,7 @@ def test_a_leader_that_stands_gets_lost(learner: str, end: tuple[bool, bool, str
 )
 def test_outlines_that_meet_end_the_episode(learner: str, end: tuple[bool, bool, str]) -> None:
     env = FormationEnv(learner=learner, others=Idle(), lost_beyond_mm=1e5)
-    # The first stands still, turned towards nobody; the second is pushed into it by its start.
+    # The first stands still, facing no other robot; the second is pushed into it by its start.
     env.reset(seed=0, options={"poses": [put(0, 0), put(0, -219.9), put(0, -900)]})
     terminated, truncated, info = last_step(env)
     assert (terminated, truncated, info["end"]) == end

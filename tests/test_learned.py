@@ -333,9 +333,9 @@ def test_nothing_is_written_of_a_policy_that_is_wrong(tmp_path):
             written(tmp_path / "none", tensors=tensors)
     with pytest.raises(ValueError, match=r"must end in \.safetensors"):
         write_policy(tmp_path / "a.bin", MLP, random_tensors(MLP), TWIST, **TOLD)
-    told = TOLD | {"scores": {"return": float("nan")}}
+    shown = TOLD | {"scores": {"return": float("nan")}}
     with pytest.raises(ValueError, match="JSON"):
-        write_policy(tmp_path / "a.safetensors", MLP, random_tensors(MLP), TWIST, **told)
+        write_policy(tmp_path / "a.safetensors", MLP, random_tensors(MLP), TWIST, **shown)
     assert not list(tmp_path.iterdir())
 
 
@@ -354,9 +354,9 @@ def test_a_policy_that_does_not_fit_is_reported_with_both_values(fields, said, t
     for make in (make_policy, fit_policy):
         with pytest.raises(
             ValueError, match=r"^policy '.*policy\.safetensors' does not fit"
-        ) as told:
+        ) as shown:
             make(path, scenario)
-        assert said in str(told.value)
+        assert said in str(shown.value)
 
 
 @pytest.mark.parametrize(
@@ -369,9 +369,9 @@ def test_a_policy_that_does_not_fit_is_reported_with_both_values(fields, said, t
 )
 def test_a_residual_needs_its_base_and_its_estimator(fields, said, tmp_path):
     path = str(written(tmp_path, scenario=RESIDUAL))
-    with pytest.raises(ValueError, match="does not fit") as told:
+    with pytest.raises(ValueError, match="does not fit") as shown:
         fit_policy(path, load_scenario(**(SHORT | fields)))
-    assert said in str(told.value)
+    assert said in str(shown.value)
 
 
 def test_another_action_takes_whatever_estimator_is_set(tmp_path):
@@ -502,15 +502,15 @@ def test_run_gives_a_policy_the_fields_that_it_asks_for_and_reports_them(
     words = ["run", "infinity", "--policy", "policy.safetensors", "--horizon-s", "0.4"]
     words += ["--no-figures", "--out", "out"]
     run_tlf([*words, "--json"], monkeypatch)
-    told = capsys.readouterr()
-    assert "policy.safetensors asks for action residual, residual_base printed" in told.err
-    assert json.loads(told.out)["scenario"]["action"] == "residual"
+    shown = capsys.readouterr()
+    assert "policy.safetensors asks for action residual, residual_base printed" in shown.err
+    assert json.loads(shown.out)["scenario"]["action"] == "residual"
     with pytest.raises(SystemExit) as end:
         run_tlf([*words, "--estimator", "truth"], monkeypatch)
     assert end.value.code == 2
-    told = capsys.readouterr().err
-    assert "\n" not in told.strip()
-    assert "with estimator 'ekf', the scenario has 'truth'" in told
+    shown = capsys.readouterr().err
+    assert "\n" not in shown.strip()
+    assert "with estimator 'ekf', the scenario has 'truth'" in shown
 
 
 def test_bench_compares_policies_that_act_otherwise(tmp_path, monkeypatch, capsys):
@@ -542,8 +542,6 @@ def test_bench_compares_policies_that_act_otherwise(tmp_path, monkeypatch, capsy
 def learner():
     pytest.importorskip("stable_baselines3")
     import gymnasium
-
-    import tlf_env  # noqa: F401  registers the environments
 
     return gymnasium.make("tlf_env/Infinity-v0", horizon_s=20.0)
 

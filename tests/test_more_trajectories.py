@@ -74,7 +74,7 @@ every = pytest.mark.parametrize("trajectory", ALL.values(), ids=ALL.keys())
 
 
 def message(build, *args, **kwargs) -> str:
-    with pytest.raises(ValueError) as caught:  # noqa: PT011  what it says is for the caller
+    with pytest.raises(ValueError, match=r"\S") as caught:
         build(*args, **kwargs)
     error = caught.value
     text = one_line(error) if isinstance(error, ValidationError) else str(error)

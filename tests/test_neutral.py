@@ -228,8 +228,8 @@ def test_a_new_channel_needs_no_entry(monkeypatch):
     for value in (2.0, 3.0):
         scenario = load_scenario(ROUND)
         slip = group(gust_mm_s=Constant(value=value))
-        told = scenario.disturbance.model_copy(update={"slip": slip})
-        assert (scenario_hash(scenario.model_copy(update={"disturbance": told})) == before) == (
+        changed = scenario.disturbance.model_copy(update={"slip": slip})
+        assert (scenario_hash(scenario.model_copy(update={"disturbance": changed})) == before) == (
             value == 2.0
         )
 

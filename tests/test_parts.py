@@ -157,7 +157,7 @@ def go_on(env: FormationParallelEnv, seen: dict[str, np.ndarray], seconds: float
 # The same as the built-in ones
 
 
-# With noise the ∞ starts in a skid that turns a last bit into 0.03 mm within 3 s, whoever estimates.
+# With noise the ∞ starts in a skid that turns a last bit into 0.03 mm within 3 s, with any estimator.
 @pytest.mark.parametrize(("task", "disturbance"), [("infinity", "none"), ("flower", "nominal")])
 @pytest.mark.parametrize("role", [*PAPERS_PARTS, "all"])
 def test_the_papers_parts_in_python_are_the_built_in_ones(

@@ -149,9 +149,9 @@ def test_a_bad_controller_file_is_reported_in_one_line(text, said, tmp_path):
     path = tmp_path / "mine.yaml"
     if text is not None:
         path.write_text(text)
-    with pytest.raises(ValueError, match=r"^[^\n]*mine\.yaml[^\n]*$") as told:
+    with pytest.raises(ValueError, match=r"^[^\n]*mine\.yaml[^\n]*$") as shown:
         make_policy(f"reference:{path}", SCENARIO)
-    assert said in str(told.value)
+    assert said in str(shown.value)
 
 
 def test_a_controller_file_counts_as_the_policys_source(tmp_path):
@@ -343,11 +343,11 @@ def test_a_run_notes_the_start_at_speed_once_and_beside_the_result(
     words = ["infinity", "--no-figures", "--horizon-s", "0.2", "--out", str(tmp_path), *as_json]
     monkeypatch.setattr(sys, "argv", ["tlf", "run", *words])
     main()
-    told = capsys.readouterr()
-    assert told.err.count("tlf: note: the reference starts at 559 mm/s") == 1
-    assert "559" not in told.out
+    shown = capsys.readouterr()
+    assert shown.err.count("tlf: note: the reference starts at 559 mm/s") == 1
+    assert "559" not in shown.out
     if as_json:
-        json.loads(told.out)
+        json.loads(shown.out)
 
 
 def test_a_zip_is_loaded_only_on_trust(tmp_path):
@@ -363,8 +363,6 @@ def test_a_zip_is_loaded_only_on_trust(tmp_path):
 def learner():
     pytest.importorskip("stable_baselines3")
     import gymnasium
-
-    import tlf_env  # noqa: F401  registers the environments
 
     return gymnasium.make("tlf_env/Infinity-v0")
 

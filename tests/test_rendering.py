@@ -466,7 +466,7 @@ def test_patches_show_as_strong_as_the_level_makes_them() -> None:
 
 @pytest.fixture
 def drawings(monkeypatch: pytest.MonkeyPatch) -> list[float]:
-    """Times (s) of the scenes drawn, in a window that nobody sees."""
+    """Times (s) of the scenes drawn, in a window that is not shown."""
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
     pygame.display.quit()
     times_s: list[float] = []

@@ -490,12 +490,12 @@ def test_constant_friction_warns_as_the_same_tyres_do():
     weak = {"mu_static": 0.2 * tyre.mu_static, "mu_dynamic": 0.2 * tyre.mu_dynamic}
     expected = grip_warnings(robot={"tyre": weak})
     assert any("static grip limit" in line for line in expected)
-    for told in (
+    for disturbance in (
         {"tyre": {"friction_scale": 0.2}},
         {"tyre": {"friction_scale": 0.6}, "level": 2.0},
         {"tyre": {"friction_scale": {"type": "constant", "value": 0.2}}},
     ):
-        assert grip_warnings(disturbance=told) == expected
+        assert grip_warnings(disturbance=disturbance) == expected
 
 
 @pytest.mark.parametrize("wheel", ["torque_gain_l", "torque_gain_r"])
@@ -506,7 +506,7 @@ def test_a_weak_motor_warns_as_a_lower_limit_does(wheel):
 
 
 @pytest.mark.parametrize(
-    "told",
+    "disturbance",
     [
         {"tyre": {"friction_scale": 0.2}, "level": 0.0},
         {"tyre": {"friction_scale": {"type": "uniform", "low": 0.1, "high": 0.2}}},
@@ -515,8 +515,8 @@ def test_a_weak_motor_warns_as_a_lower_limit_does(wheel):
         {"tyre": {"friction_scale": 2.0}},
     ],
 )
-def test_what_is_not_constantly_weak_does_not_warn(told):
-    assert grip_warnings(disturbance=told) == []
+def test_what_is_not_constantly_weak_does_not_warn(disturbance):
+    assert grip_warnings(disturbance=disturbance) == []
 
 
 def test_a_motor_that_gives_nothing_is_told():
@@ -564,7 +564,7 @@ def test_a_reference_beyond_the_fixes_is_told_with_its_place():
 
 
 def test_the_sensor_warning_is_where_the_entry_saturates():
-    """The first time that is told is the first at which an entry of a perfect fix is clipped."""
+    """The first time that is reported is the first at which an entry of a perfect fix is clipped."""
     (line,) = sensor_lines(5100.0)
     told_s = float(re.match(r"t = (\S+) s", line)[1])
     scale = SAMPLE_ENTRIES["fix_x"].scale

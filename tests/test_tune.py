@@ -410,10 +410,10 @@ def refused(words, tmp_path, monkeypatch, capsys):
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 2
-    told = capsys.readouterr().err
-    assert "\n" not in told.strip()
+    shown = capsys.readouterr().err
+    assert "\n" not in shown.strip()
     assert not (tmp_path / "out").exists()
-    return told
+    return shown
 
 
 def test_the_command_prints_its_result(tmp_path, monkeypatch, capsys):
