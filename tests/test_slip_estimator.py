@@ -605,10 +605,10 @@ class Steps:
         self.after = self.off[np.array(new)] / np.array(motion)  # (steps, 2)
 
 
-def test_new_slip_is_known_sooner_by_the_wheels():
-    """Where the wheel loop lets them follow the floor, they jump by it, since the body does not.
+def test_new_slip_is_found_sooner_from_the_wheel_speeds():
+    """The wheels follow a floor that starts to move, and the body does not: their speed jumps by the slip.
 
-    Without them hardly anything of a change is known at the end of the control period in which it came.
+    Without the wheel speeds hardly any of a change is estimated by the end of its control period.
     """
     quick, slow = Steps({}), Steps({}, **NO_WHEELS)
     assert (np.median(quick.after, axis=0) < 0.8).all()
@@ -623,7 +623,8 @@ def test_new_slip_is_known_sooner_by_the_wheels():
         pytest.param(
             1.1,
             marks=pytest.mark.xfail(
-                strict=True, reason="11 to 18 % worse, where 10 were hoped for"
+                strict=True,
+                reason="rough encoders make the slip estimate 11 to 18 % worse; the bound is 10 %",
             ),
         ),
     ],
@@ -631,13 +632,13 @@ def test_new_slip_is_known_sooner_by_the_wheels():
 @pytest.mark.parametrize(
     "encoder", [{"noise_std_rad": 0.002}, {"quantum_rad": 2 * math.pi / 4096}], ids=str
 )
-def test_rough_encoders_tell_no_false_slip(encoder, bound):
-    """How rough they are is learned: the estimate is worse by a fifth at most, and not by multiples."""
+def test_rough_encoders_give_no_false_slip(encoder, bound):
+    """Their roughness is estimated: the slip estimate gets worse by a fifth at most."""
     quick, slow = Steps(encoder), Steps(encoder, **NO_WHEELS)
     assert (quick.off[500:].mean(axis=0) < bound * slow.off[500:].mean(axis=0)).all()
 
 
-def test_without_the_learned_roughness_rough_encoders_would_tell_false_slip():
+def test_without_the_estimated_roughness_rough_encoders_give_false_slip():
     """So the test above can fail."""
     change = np.random.default_rng(9).normal(0.0, 0.14, 2000)  # mm: 2 mrad of noise in two readings
     calm = [abs(split_change(c, c, 0.0, MOST, 0.14**2, 0.0)[1]) for c in change]

@@ -17,40 +17,42 @@ from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.compiled import block, law
 
-STREAMS = np.array([channel.stream for channel in CHANNELS])
-NOMINALS = np.array([channel.nominal for channel in CHANNELS])
-LOWS = np.array([channel.low for channel in CHANNELS])
-HIGHS = np.array([channel.high for channel in CHANNELS])
+STREAMS = np.array([one.stream for one in CHANNELS])
+NOMINALS = np.array([one.nominal for one in CHANNELS])
+LOWS = np.array([one.low for one in CHANNELS])
+HIGHS = np.array([one.high for one in CHANNELS])
 # Places of the channels by their rate.
 OF_SUBSTEPS, OF_STEPS = numbers(SUBSTEP), numbers(CONTROL_STEP)
 
 
 @block
-def evaluate(arrays: Arrays, lane: int, robot: int, c: int, tick: int, settings: Settings) -> None:
-    """Evaluate channel ``c`` for one robot at a tick."""
-    signal = arrays.signals[arrays.variants[lane], c]
-    value, arrays.processes[c, robot, lane] = signal_value(
+def evaluate(
+    arrays: Arrays, lane: int, robot: int, channel: int, tick: int, settings: Settings
+) -> None:
+    """Evaluate a channel (its place in the table) for one robot at a tick."""
+    signal = arrays.signals[arrays.variants[lane], channel]
+    value, arrays.processes[channel, robot, lane] = signal_value(
         SignalRow(signal[0], signal[1], signal[2], signal[3], signal[4]),
         tick,
         settings.dt,
         arrays.seeds[lane],
-        STREAMS[c],
+        STREAMS[channel],
         robot,
         arrays.clock[lane, 2],
-        arrays.processes[c, robot, lane],
+        arrays.processes[channel, robot, lane],
     )
-    value = NOMINALS[c] + arrays.levels[lane] * (value - NOMINALS[c])
-    value = min(max(value, LOWS[c]), HIGHS[c])
-    if settings.adversary and not np.isnan(arrays.imposed[c, robot, lane]):
-        value = arrays.imposed[c, robot, lane]
-    arrays.applied[c, robot, lane] = value
+    value = NOMINALS[channel] + arrays.levels[lane] * (value - NOMINALS[channel])
+    value = min(max(value, LOWS[channel]), HIGHS[channel])
+    if settings.adversary and not np.isnan(arrays.imposed[channel, robot, lane]):
+        value = arrays.imposed[channel, robot, lane]
+    arrays.applied[channel, robot, lane] = value
 
 
 @law
 def evaluate_all(arrays: Arrays, lane: int, robot: int, settings: Settings) -> None:
     """Evaluate all channels of one robot at the start of an episode."""
-    for c in range(arrays.applied.shape[0]):
-        evaluate(arrays, lane, robot, c, 0, settings)
+    for channel in range(arrays.applied.shape[0]):
+        evaluate(arrays, lane, robot, channel, 0, settings)
 
 
 @law
@@ -66,10 +68,10 @@ def refresh(
     """Evaluate the given channels that may have changed in the last ``ticks``; return whether any may have."""
     found = False
     for i in range(channels.shape[0]):
-        c = channels[i]
-        signal = arrays.signals[arrays.variants[lane], c]
+        channel = channels[i]
+        signal = arrays.signals[arrays.variants[lane], channel]
         if settings.adversary or is_due(signal[0], signal[4], tick, ticks):
-            evaluate(arrays, lane, robot, c, tick, settings)
+            evaluate(arrays, lane, robot, channel, tick, settings)
             found = True
     return found
 

@@ -263,7 +263,7 @@ def _prefixed(prefix: str, joint: Joint) -> dict[str, float]:
 
 def weighed(
     m: float,
-    I: float,  # noqa: E741
+    I: float,  # noqa: E741  the symbol of the equations
     d: float,
     drive_share: float,
     castor_share: float,
