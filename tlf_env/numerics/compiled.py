@@ -24,12 +24,23 @@ import numba
 import platformdirs
 from numba.core import types
 from numba.core.cgutils import create_struct_proxy
+from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).resolve().parent.parent
 ROOMS_WITH_LAWS = ("numerics", "physics", "onboard", "disturbances", "task", "engine")
+
+
+if hasattr(os, "register_at_fork"):
+    # A child has only the thread that forked: a lock that another one held would stay locked for ever.
+    # So a fork waits until no other thread compiles.
+    os.register_at_fork(
+        before=global_compiler_lock.acquire,
+        after_in_parent=global_compiler_lock.release,
+        after_in_child=global_compiler_lock.release,
+    )
 
 
 @functools.cache
