@@ -174,6 +174,8 @@ class Formation:
     def _substep_by_substep(self, close: bool) -> None:
         arrays, settings = self.arrays, self._settings
         motion = arrays.rows("motion")
+        if close:
+            self.plant.sort(motion)
         for substep in range(settings.substeps):
             self._parts.drive(arrays, substep, settings)
             before = motion.copy() if close else motion
