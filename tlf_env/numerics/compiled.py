@@ -35,7 +35,6 @@ from numba.core.caching import (
 )
 from numba.core.cgutils import create_struct_proxy
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.dispatcher import Dispatcher
 from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., Any])
@@ -259,7 +258,7 @@ def allocating(function: F) -> F:
 def driver(function: F) -> F:
     """Compile a function over arrays, and keep the result on disk."""
     dispatcher: Any = numba.njit(error_model="numpy", nogil=True)(function)
-    if isinstance(dispatcher, Dispatcher):  # not if Numba is switched off
+    if dispatcher is not function:  # as it is where Numba is switched off
         dispatcher._cache = _NothingKept() if cache_folder() is None else _Cache(function)
     compiled: F = dispatcher
     return compiled

@@ -91,7 +91,7 @@ class PymunkPlant:
         """Make the space's index of outlines anew, robot by robot; to be called before a control step.
 
         The order in which Chipmunk solves contacts comes from that index, which otherwise depends on all
-        that happened before, even on whether somebody looked at :meth:`space`. A body that changes its
+        that happened before, even on whether :meth:`space` was read. A body that changes its
         type leaves the index and enters it again, and keeps its contacts. Two robots have only one.
         """
         if len(self._bodies) <= 2:
