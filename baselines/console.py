@@ -31,7 +31,8 @@ def warn_of_compiling() -> None:
     """Announce the compilation before the first run on a machine."""
     from tlf_env.numerics.compiled import cache_folder
 
-    if not any(cache_folder().rglob("*control_step*.nbi")):
+    folder = cache_folder()
+    if folder is None or not any(folder.rglob("*control_step*.nbi")):
         notes.print("Compiling the step drivers, once on this machine: about a minute.")
 
 

@@ -81,6 +81,7 @@ class BatchPlant:
         self._poses = NO_POSES  # start poses of the present episodes, if any are given
         self._nothing = empty_excerpt(self.arrays, 0, 0)
         self._pool: ThreadPoolExecutor | None = None
+        self._pool_pid = 0
 
     @property
     def scenario(self) -> Scenario:
@@ -248,9 +249,9 @@ class BatchPlant:
             helper.result()
 
     def _others(self) -> ThreadPoolExecutor:
-        """The other threads, kept from step to step."""
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self.threads - 1)
+        """The other threads, kept from step to step; a forked child has to start its own."""
+        if self._pool is None or self._pool_pid != os.getpid():
+            self._pool, self._pool_pid = ThreadPoolExecutor(self.threads - 1), os.getpid()
         return self._pool
 
     @property

@@ -43,6 +43,17 @@ def reference_table(scenario: Scenario, phase_s: float = 0.0) -> np.ndarray:
 STATE_SCALES = np.array(
     [1000.0, 1000.0, 1.0, 1.0, 1.0, 500.0, 500.0, 2.0, 10.0, 10.0, 1000.0, 1000.0]
 )
+# No entry, so divided, is ever larger: a sine, an angle, and elsewhere far more than a model can reach.
+STATE_LIMITS = np.array([1e12, 1e12, 1.0, 1.0, np.pi, 1e12, 1e12, 1e12, 1e12, 1e12, 1e12, 1e12])
+STATE_ROUNDING_MM = 0.01  # of a position; float32 is not enough where it would round by more
+
+
+def state_dtype(scenario: Scenario, path: np.ndarray) -> np.dtype:
+    """The dtype of the scaled state: float32, unless the scenario or a ``path`` far away wants float64."""
+    farthest = np.float32(np.abs(path).max() / STATE_SCALES[0])
+    rounding_mm = float(np.spacing(farthest)) / 2 * STATE_SCALES[0]
+    exact = scenario.dtype == "float64" or rounding_mm > STATE_ROUNDING_MM
+    return np.dtype(np.float64 if exact else np.float32)
 
 
 USUAL_START = Start(poses=None, phases_s=None)
@@ -175,6 +186,8 @@ class Formation:
     def _substep_by_substep(self, close: bool) -> None:
         arrays, settings = self.arrays, self._settings
         motion = arrays.rows("motion")
+        if close:
+            self.plant.sort(motion)
         for substep in range(settings.substeps):
             self._parts.drive(arrays, substep, settings)
             before = motion.copy() if close else motion

@@ -16,7 +16,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from tlf_env.disturbances.model import PatchRow, patch_rows
-from tlf_env.engine.formation import STATE_SCALES, Formation
+from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, state_dtype
 from tlf_env.engine.judging import terminated, truncated
 from tlf_env.engine.readout import info_rows
 from tlf_env.envs.spec import documented
@@ -24,7 +24,7 @@ from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import Factory, part_name, real_numbers
 from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.info import INFO_KEYS, InfoChoice, State, chosen_keys
+from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
 from tlf_env.task.start import start_options
@@ -128,8 +128,10 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             agent: gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), dtype.type)
             for agent in self.possible_agents
         }
+        limits = np.tile(STATE_LIMITS, len(self.possible_agents))
+        dtype = state_dtype(self.scenario, self._formation.leader_path())
         self.state_space = gymnasium.spaces.Box(
-            -np.inf, np.inf, (len(self.possible_agents) * len(State._fields),), np.float32
+            -limits.astype(dtype), limits.astype(dtype), dtype=dtype.type
         )
         self._adversary = adversary
         self._renderer: Any = None
@@ -289,8 +291,13 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return dict(zip(self.possible_agents, named, strict=True))
 
     def state(self) -> np.ndarray:
-        """The true state for critics, float32: scaled :class:`tlf_env.task.info.State` of every robot."""
-        return (self._formation.state() / STATE_SCALES).astype(np.float32).ravel()
+        """The true state for critics: scaled :class:`tlf_env.task.info.State` of every robot.
+
+        float32; but float64 if the scenario's ``dtype`` is, or if the reference path lies so far from the
+        origin (some 260 m) that float32 would round a position by more than 0.01 mm.
+        """
+        scaled = self._formation.state() / STATE_SCALES
+        return scaled.astype(self.state_space.dtype).ravel()
 
     def render(self) -> np.ndarray | None:
         """A frame ``(height, width, 3)`` uint8 in mode ``rgb_array``; None in mode ``human``.
