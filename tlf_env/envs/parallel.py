@@ -29,10 +29,11 @@ from tlf_env.task.info import END_REASONS, Info, State
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
+from tlf_env.task.waypoints import MAX_COORDINATE_MM
 
 Agent = str
 Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
-START_POSE_LIMIT_MM = 1e9
+START_POSE_LIMIT_MM = MAX_COORDINATE_MM
 PETTINGZOO_TEST_OPTION = "options"  # PettingZoo's API test passes this option; it is ignored
 
 
