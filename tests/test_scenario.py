@@ -7,7 +7,6 @@ import math
 import re
 from collections.abc import Iterator
 
-import gymnasium
 import numpy as np
 import pytest
 import yaml
@@ -16,8 +15,6 @@ from pydantic import ValidationError
 import tlf_env
 from baselines import ReferencePolicy
 from tlf_env.common.presets import preset_names, presets_folder
-from tlf_env.envs.parallel import ReferenceWarning
-from tlf_env.envs.single import FormationEnv
 from tlf_env.task.observation import OBSERVATION_LIMIT, SAMPLE_ENTRIES
 from tlf_env.task.scenario import Scenario, load_scenario, scenario_notes, scenario_warnings
 from tlf_env.task.trajectories import sample
@@ -596,17 +593,3 @@ def test_a_horizon_beyond_the_clock_is_told():
     (line,) = sensor_lines(horizon_s=1000.02)
     assert "t = 1000 s" in line
     assert "1000.02 s" in line
-
-
-def test_a_warning_points_at_who_makes_the_environment():
-    far = {"trajectory": {**CIRCLE, "radius_mm": 1000.0, "speed_mm_s": 1100.0}}
-    makers = (
-        lambda: tlf_env.parallel_env(far),
-        lambda: tlf_env.aec_env(far),
-        lambda: FormationEnv(far),
-        lambda: gymnasium.make("tlf_env/Infinity-v0", trajectory=far["trajectory"]),
-    )
-    for make in makers:
-        with pytest.warns(ReferenceWarning) as caught:
-            make()
-        assert {item.filename for item in caught if item.category is ReferenceWarning} == {__file__}

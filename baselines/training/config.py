@@ -127,6 +127,17 @@ class TrainConfig(Frozen):
             for name in self.evaluation.disturbances
         }
 
+    def named_scenarios(self) -> list[tuple[str, Scenario]]:
+        """Every scenario of the training and of its evaluation, with its task and disturbance."""
+        tasks, _ = self.mixture()
+        trained = [
+            (f"{task}, {one.disturbance.name}", one)
+            for task, scenarios in tasks.items()
+            for one in scenarios
+        ]
+        evaluated = self.evaluation_scenarios().items()
+        return trained + [(", ".join(place), scenario) for place, scenario in evaluated]
+
     def _scenario(self, task: str, disturbance: str, level: float | None, **more: Any) -> Scenario:
         """A task's scenario; an error names the place of the key in the configuration."""
         own = self.tasks[task]

@@ -207,7 +207,8 @@ class TuneConfig(Frozen):
             times = self.search[path].times
             factor = 1.0 if times is None else value_at(tree, times)
             tree = with_value(tree, path, _rounded(values[path] * factor))
-        slip = tree.pop("ekf_slip") if self.estimator == "ekf-slip" else None
+        own = tree.pop("ekf_slip")
+        slip = own if self.estimator == "ekf-slip" else None
         try:
             return ControllerFile.model_validate(
                 {"controller": tree, "estimator": self.estimator, "ekf_slip": slip}

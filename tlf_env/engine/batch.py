@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tlf_env.common.errors import shown
 from tlf_env.engine import drivers, judging, readout
 from tlf_env.engine.arrays import Arrays, make_arrays, make_variants
 from tlf_env.engine.excerpt import Excerpt, empty_excerpt
@@ -20,6 +21,7 @@ from tlf_env.engine.starting import STARTED
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.scenario import Scenario, load_scenario
+from tlf_env.task.warn import warn_of
 
 Source = str | Path | Mapping[str, Any] | Scenario
 
@@ -68,6 +70,7 @@ class BatchPlant:
         if not isinstance(scenario, Sequence) or isinstance(scenario, str):
             scenario = [scenario]
         self.scenarios = _alike([_for_lanes(source, overrides) for source in scenario])
+        warn_of(self.scenarios)
         self.formations = _positive("formations", formations)
         self.threads = _positive("threads", os.cpu_count() or 1 if threads is None else threads)
         table = reference_table(self.scenario)
@@ -168,8 +171,7 @@ class BatchPlant:
         given = real_numbers(actions)
         if given is None:
             raise ValueError(
-                f"actions must be real numbers in the shape {arrays.actions.shape}, got "
-                f"{' '.join(repr(actions).split()):.60}"
+                f"actions must be real numbers in the shape {arrays.actions.shape}, got {shown(actions)}"
             )
         if given.shape != arrays.actions.shape:
             raise ValueError(

@@ -11,6 +11,7 @@ import numpy as np
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from tlf_env.common.errors import shown
 from tlf_env.disturbances.channels import PATHS
 from tlf_env.engine import judging
 from tlf_env.engine.batch import BatchPlant
@@ -189,7 +190,8 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         given = real_numbers(actions)
         if given is None:
             raise ValueError(
-                f"actions must be real numbers, got {' '.join(repr(actions).split()):.60}"
+                f"actions must be real numbers in the shape {self._actions[:, self._robot].shape}, got "
+                f"{shown(actions)}"
             )
         if given.shape != self._actions[:, self._robot].shape:
             raise ValueError(
