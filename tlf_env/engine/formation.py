@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pymunk
 
+from tlf_env.common.errors import shown
 from tlf_env.disturbances.channels import (
     CHANNELS,
     PAYLOAD_BEHIND,
@@ -24,7 +25,7 @@ from tlf_env.engine.outside_parts import Parts, part_factories
 from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.onboard.observer import Reference
-from tlf_env.onboard.parts import Factory
+from tlf_env.onboard.parts import Factory, real_numbers
 from tlf_env.physics.pymunk_plant import PymunkPlant
 from tlf_env.physics.vehicle import Body
 from tlf_env.task.info import Info
@@ -142,10 +143,10 @@ class Formation:
             high = channel.high
             if path == "actuator.computing_delay_s":
                 high = min(high, self.scenario.control_period_s)
-            row = np.asarray(value, dtype=np.float64)
-            if row.shape not in ((), (robots,)):
+            row = real_numbers(value)
+            if row is None or row.shape not in ((), (robots,)):
                 raise ValueError(
-                    f"{path} must be a number or one per robot ({robots}), got {value!r}"
+                    f"{path} must be a number or one per robot ({robots}), got {shown(value)}"
                 )
             if not ((row >= channel.low) & (row <= high)).all():
                 raise ValueError(

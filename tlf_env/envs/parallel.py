@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import sys
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ import pymunk
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
+from tlf_env.common.errors import shown
 from tlf_env.disturbances.model import PatchRow, patch_rows
 from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, state_dtype
 from tlf_env.engine.judging import terminated, truncated
@@ -26,27 +25,14 @@ from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
-from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
+from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.start import start_options
+from tlf_env.task.warn import ReferenceWarning as ReferenceWarning
+from tlf_env.task.warn import warn_of
 
 Agent = str
 Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
 PETTINGZOO_TEST_OPTION = "options"  # PettingZoo's API test passes this option; it is ignored
-
-
-MAKERS = ("tlf_env", "gymnasium", "pettingzoo")  # packages between a caller and the environment
-
-
-class ReferenceWarning(UserWarning):
-    """The reference exceeds limits of the robots or of the observation."""
-
-
-def callers_level() -> int:
-    """``stacklevel`` of a warning by the calling function: the first frame outside :data:`MAKERS`."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in MAKERS:
-        level, frame = level + 1, frame.f_back
-    return level
 
 
 @documented
@@ -101,8 +87,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self._info_keys = chosen_keys(infos)
         self._pick = [INFO_KEYS.index(key) for key in self._info_keys]
         self._scenario = load_scenario(scenario, **overrides)
-        for line in scenario_warnings(self.scenario):
-            warnings.warn(line, ReferenceWarning, stacklevel=callers_level())
+        warn_of([self.scenario])
         self.metadata: dict[str, Any] = {
             "name": f"tlf_env/{self.scenario.name}-v0",
             "render_modes": list(RENDER_MODES),
@@ -246,7 +231,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
 
     def _take(self, actions: dict[Agent, np.ndarray]) -> None:
         buffer = self._formation.arrays.actions[0]
-        if len(actions) != len(self.agents):
+        if not isinstance(actions, Mapping) or len(actions) != len(self.agents):
             self._complain(actions)
         for i, agent in enumerate(self.agents):
             try:
@@ -256,8 +241,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             numbers = real_numbers(action)
             if numbers is None:
                 raise ValueError(
-                    f"{agent}: the action must be {ACTION_SIZE} numbers, got "
-                    f"{' '.join(repr(action).split())}"
+                    f"{agent}: the action must be {ACTION_SIZE} numbers, got {shown(action)}"
                 )
             if numbers.shape != (ACTION_SIZE,):
                 raise ValueError(
@@ -265,7 +249,12 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                 )
             buffer[i] = numbers
 
-    def _complain(self, actions: dict[Agent, np.ndarray]) -> None:
+    def _complain(self, actions: Any) -> None:
+        if not isinstance(actions, Mapping):
+            raise ValueError(
+                f"actions must be a mapping {{agent: {ACTION_SIZE} numbers}} with the agents "
+                f"{', '.join(self.agents)}, got {shown(actions)}"
+            )
         unknown = [agent for agent in actions if agent not in self.agents]
         missing = [agent for agent in self.agents if agent not in actions]
         what = f"{unknown[0]!r} is not an agent" if unknown else f"no action for {missing[0]}"
