@@ -310,7 +310,6 @@ def test_scenarios_that_differ_elsewhere_are_refused(change, said):
         ({"wheel_loop": "mine:Loop"}, "wheel_loop 'mine:Loop'"),
         ({"adversary": True}, "adversary"),
         ({"adversary": True, "plant": "kinematic"}, "adversary"),
-        ({"no_such": 1}, "no_such"),
     ],
 )
 def test_what_cannot_run_in_a_batch_is_told(options, said):
