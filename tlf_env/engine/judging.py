@@ -31,6 +31,9 @@ from tlf_env.task.measures import distance, time_gap_error
 from tlf_env.task.observation import Preview, SensorTail, Tracking, preview_entries, scaled
 from tlf_env.task.reward import reward_terms
 
+# For each EndReason, whether it is a failure of the robot itself, or cuts the episode off.
+TERMINATES = (False, True, True, False, False)
+TRUNCATES = (False, False, False, True, True)
 CLIPPED = Info._fields.index("clipped")
 BODY_D = in_array("body", "d")
 
@@ -254,9 +257,9 @@ def end_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
 
 def terminated(ends: np.ndarray) -> np.ndarray:
     """Whether a robot ended the episode because it was lost or touched another; any shape."""
-    return (ends == LOST) | (ends == TOUCHED)
+    return np.array(TERMINATES)[ends]
 
 
 def truncated(ends: np.ndarray) -> np.ndarray:
     """Whether another robot or the horizon ended a robot's episode; any shape."""
-    return (ends == OTHER_ROBOT) | (ends == HORIZON)
+    return np.array(TRUNCATES)[ends]

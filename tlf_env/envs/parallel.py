@@ -16,7 +16,7 @@ from pettingzoo.utils.conversions import parallel_to_aec
 from tlf_env.common.errors import shown
 from tlf_env.disturbances.model import PatchRow, patch_rows
 from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, state_dtype
-from tlf_env.engine.judging import terminated, truncated
+from tlf_env.engine.judging import TERMINATES, TRUNCATES
 from tlf_env.engine.readout import info_rows
 from tlf_env.envs.spec import documented
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
@@ -221,11 +221,11 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self._formation.step()
         a = self._formation.arrays
         rewards = dict(zip(self.agents, a.rewards[0].tolist(), strict=True))
-        over = a.ends[0].any()
-        ended = dict(zip(self.agents, terminated(a.ends[0]).tolist(), strict=True))
-        cut = dict(zip(self.agents, truncated(a.ends[0]).tolist(), strict=True))
+        ends = dict(zip(self.agents, a.ends[0].tolist(), strict=True))
+        ended = {agent: TERMINATES[end] for agent, end in ends.items()}
+        cut = {agent: TRUNCATES[end] for agent, end in ends.items()}
         observations, infos = self._observations(), self._infos()
-        if over:
+        if any(ends.values()):
             self.agents = []
         if self.render_mode == "human":
             self._draw(self.render_mode)
