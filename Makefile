@@ -2,6 +2,7 @@
 
 PYTHON ?= python3
 TORCH ?= 2.13.0
+TESTS ?= tests
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -9,7 +10,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow test-learning check format board speed speed-docs constraints clean
+.PHONY: help run test test-slow test-learning check check-lowest format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -33,6 +34,22 @@ check: $(VENV)/.stamp-test ## Lint, check format and types
 	$(BIN)/mypy
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/codespell
+
+# pip cannot choose the lowest versions, uv can; but it does not read pip's setting of folders of wheels.
+# torch comes first, so that a build of the fixed version in such a folder is taken.
+check-lowest: ## Run the tests with the lowest versions that pyproject.toml allows, in a temporary environment
+	@set -e; \
+	tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \
+	$(PYTHON) -m venv "$$tmp/tools"; \
+	"$$tmp/tools/bin/python" -m pip install -q --disable-pip-version-check uv; \
+	uv="$$tmp/tools/bin/uv"; \
+	export UV_FIND_LINKS="$${PIP_FIND_LINKS-}" VIRTUAL_ENV="$$tmp/venv"; \
+	"$$uv" venv -q --python "$(PYTHON)" "$$VIRTUAL_ENV"; \
+	"$$uv" pip install -q "torch==$(TORCH)"; \
+	"$$uv" pip install -q --resolution lowest-direct \
+		-e ".[figures,view,train,tune,bench,peers,ray,dev]"; \
+	"$$uv" pip check; \
+	"$$VIRTUAL_ENV/bin/python" -m pytest $(TESTS)
 
 format: $(VENV)/.stamp-test ## Sort the imports and format the sources
 	$(BIN)/ruff check --select I --fix
