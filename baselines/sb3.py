@@ -10,10 +10,16 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
-from tlf_env.engine.batch import BatchPlant, Source
+from tlf_env.engine.batch import BatchPlant, Source, checked_count
+from tlf_env.numerics.philox import checked_seed
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.info import END_REASONS
+from tlf_env.task.info import InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
+from tlf_env.task.start import Start, joined, same_start, start_options
+
+# A dictionary for each robot in each step: with all 50 keys they cost nearly as much as the simulation.
+CHEAP_INFOS = ("position_error_mm", "lost", "touched", "end")
+ATTRIBUTES = ("scenario", "place", "render_mode")
 
 
 class Place(NamedTuple):
@@ -45,6 +51,9 @@ class FormationVecEnv(VecEnv):
         Number of threads for a step; None: one per core.
     seed
         Formation k gets ``seed`` + k in the first ``reset``; random if None.
+    infos
+        The keys of the infos that steps and ``reset_infos`` contain, True for all, False for none. The
+        last step of an episode also contains ``terminal_observation`` and ``TimeLimit.truncated``.
     **overrides
         Fields of the scenarios, and ``disturbance_level``.
 
@@ -62,10 +71,13 @@ class FormationVecEnv(VecEnv):
         mixture: bool | Sequence[float] = False,
         threads: int | None = 1,
         seed: int | None = None,
+        infos: InfoChoice = CHEAP_INFOS,
         **overrides: Any,
     ) -> None:
         tasks = _tasks(scenario)
-        if isinstance(formations, bool) or formations < len(tasks):
+        self._info_keys = chosen_keys(infos)
+        self._starts: list[list[Start]] = []  # of the formations of each plant, for the next reset
+        if checked_count("formations", formations) < len(tasks):
             raise ValueError(
                 f"formations {formations!r} must be at least one for each of {len(tasks)} tasks"
             )
@@ -87,7 +99,7 @@ class FormationVecEnv(VecEnv):
             gymnasium.spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT, (entries,), dtype.type),
             gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), dtype.type),
         )
-        self._seed: int | None = seed
+        self._seed: int | None = None if seed is None else checked_seed(seed)
 
     def _spaces_agree(self) -> None:
         first = self.plants[0].scenario
@@ -108,22 +120,85 @@ class FormationVecEnv(VecEnv):
         return Place(plant, formation, robot)
 
     def seed(self, seed: int | None = None) -> Sequence[int | None]:
-        """Seed the next reset: formation k gets ``seed`` + k; returns each sub-environment's."""
-        self._seed = secrets.randbelow(2**31) if seed is None else int(seed)
+        """Seed the next reset: formation k gets ``seed`` + k; returns each sub-environment's.
+
+        Raises
+        ------
+        ValueError
+            for a seed that is not a whole number from 0 on.
+        """
+        self._seed = secrets.randbelow(2**31) if seed is None else checked_seed(seed)
         self._seeds = [
             self._seed + int(self._first[where.plant]) + where.formation
             for where in map(self.place, range(self.num_envs))
         ]
         return self._seeds
 
+    def set_options(
+        self, options: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None = None
+    ) -> None:
+        """Options for the next :meth:`reset`: ``poses`` and ``phase_s`` of a formation.
+
+        Parameters
+        ----------
+        options
+            A mapping for all formations, or one for each sub-environment, equal within a formation. See
+            :meth:`tlf_env.engine.batch.BatchPlant.reset`.
+
+        Raises
+        ------
+        ValueError
+            for an unknown option, an invalid value, or options that differ within a formation.
+        """
+        if options is None or isinstance(options, Mapping):
+            options = [options or {}] * self.num_envs
+        if isinstance(options, str) or not isinstance(options, Sequence):
+            raise ValueError(
+                f"options must be a mapping or a sequence of them, got {options!r:.60}"
+            )
+        if len(options) != self.num_envs:
+            raise ValueError(f"options: {len(options)} mappings for {self.num_envs} robots")
+        self._starts = [
+            self._starts_of(plant, options[first:end])
+            for plant, first, end in zip(self.plants, self._ends, self._ends[1:], strict=False)
+        ]
+
+    @staticmethod
+    def _starts_of(plant: BatchPlant, options: Sequence[Mapping[str, Any]]) -> list[Start]:
+        """The start of each formation."""
+        robots = plant.scenario.robot_count
+        starts = []
+        for k in range(plant.formations):
+            mine = options[k * robots : (k + 1) * robots]
+            each = [start_options(one, robots) for one in mine]
+            if any(not same_start(one, each[0]) for one in each):
+                raise ValueError(f"options differ between the robots of formation {k}")
+            starts.append(each[0])
+        return starts
+
     def reset(self) -> np.ndarray:
         """Start an episode of every formation, with the given seed or the next one; ``(num_envs, entries)``."""
-        for plant, first in zip(self.plants, self._first, strict=False):
-            plant.reset(None if self._seed is None else self._seed + int(first))
-        self._seed = None
+        starts = self._starts or [[] for _ in self.plants]
+        for plant, first, given in zip(self.plants, self._first, starts, strict=False):
+            plant.reset(
+                None if self._seed is None else self._seed + int(first), options=joined(given)
+            )
+        self._seed, self._starts = None, []
         self._reset_seeds()
-        self.reset_infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        self._reset_options()
+        self.reset_infos = self._infos()
         return self.observations()
+
+    def _infos(self) -> list[dict[str, Any]]:
+        """The infos of all robots in the last step."""
+        if not self._info_keys:
+            return [{} for _ in range(self.num_envs)]
+        columns = [
+            [x for plant in self.plants for x in plant.info(key).ravel().tolist()]
+            for key in self._info_keys
+        ]
+        rows = zip(*columns, strict=True)
+        return [dict(zip(self._info_keys, row, strict=True)) for row in rows]
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions, ``(num_envs, 2)``, for the step."""
@@ -153,18 +228,14 @@ class FormationVecEnv(VecEnv):
         for plant, rows in self._parts(actions):
             plant.step(rows.reshape(plant.arrays.actions.shape))
         rewards = np.concatenate([plant.rewards.ravel() for plant in self.plants])
-        infos: list[dict[str, Any]] = [{} for _ in range(self.num_envs)]
+        infos = self._infos()
         dones = np.concatenate([(plant.ends != 0).ravel() for plant in self.plants])
         if dones.any():
             last = self.observations()
-            reasons = np.concatenate([plant.ends.ravel() for plant in self.plants])
             truncated = np.concatenate([plant.truncated.ravel() for plant in self.plants])
             for i in np.flatnonzero(dones):
-                infos[i] = {
-                    "terminal_observation": last[i],
-                    "TimeLimit.truncated": bool(truncated[i]),
-                    "end": END_REASONS[reasons[i]],
-                }
+                infos[i]["terminal_observation"] = last[i]
+                infos[i]["TimeLimit.truncated"] = bool(truncated[i])
             for plant in self.plants:
                 plant.reset_finished()
         return self.observations(), rewards.astype(np.float32), dones, infos
@@ -204,11 +275,19 @@ class FormationVecEnv(VecEnv):
             plant = self.plants[where.plant]
             return plant.scenarios[plant.scenario_numbers[where.formation]]
         raise AttributeError(
-            f"a robot has no attribute {name!r}; there are scenario, place, render_mode"
+            f"a robot has no attribute {name!r}; there are {', '.join(ATTRIBUTES)}"
         )
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Store a value for sub-environments, for ``get_attr``; it has no other effect."""
+        """Store a value for sub-environments, for ``get_attr``; it has no other effect.
+
+        Raises
+        ------
+        AttributeError
+            for an attribute of the environment itself, as ``scenario``.
+        """
+        if attr_name in ATTRIBUTES:
+            raise AttributeError(f"{attr_name} cannot be set; make another environment")
         for i in self._get_indices(indices):
             self._attributes[i][attr_name] = value
 

@@ -12,7 +12,7 @@ import gymnasium
 import numpy as np
 import typer
 
-import tlf_env  # noqa: F401 importing it registers the environments with Gymnasium
+import tlf_env  # importing it registers the environments with Gymnasium
 
 
 def episode_return(env: gymnasium.Env, *, random: bool, seed: int) -> tuple[float, str]:
@@ -25,7 +25,7 @@ def episode_return(env: gymnasium.Env, *, random: bool, seed: int) -> tuple[floa
         _seen, reward, terminated, truncated, info = env.step(action)
         total += float(reward)
         over = terminated or truncated
-    return total, info["end"]
+    return total, tlf_env.EndReason(info["end"]).name
 
 
 def main(horizon_s: float = 30.0, seed: int = 0) -> None:

@@ -27,7 +27,8 @@ def main(horizon_s: float = 30.0, seed: int = 0) -> None:
         for agent, reward in rewards.items():
             returns[agent] += reward
 
-    print(f"ended by {infos['robot_0']['end']} after {env.formation.time_s:g} s")
+    end = tlf_env.EndReason(infos["robot_0"]["end"])
+    print(f"ended by {end.name} after {env.formation.time_s:g} s")
     for agent, info in infos.items():
         print(
             f"{agent}: {info['position_error_mm']:6.2f} mm off its reference, "

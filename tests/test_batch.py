@@ -13,7 +13,7 @@ from baselines.runs.run import run_policy, run_seeds
 from tlf_env import BatchPlant
 from tlf_env.common.presets import preset_names
 from tlf_env.engine.formation import Formation
-from tlf_env.task.info import END_REASONS
+from tlf_env.task.info import EndReason
 from tlf_env.task.scenario import load_scenario
 
 DISTURBANCES = preset_names("disturbance")
@@ -199,13 +199,15 @@ def test_ends_are_those_of_the_environment(end_on):
             observations, _, ended, cut, infos = env.step(dict(zip(agents, rows, strict=True)))
             assert list(ended.values()) == terminated[k].tolist()
             assert list(cut.values()) == truncated[k].tolist()
-            ends_by_agent = [infos[agent].get("end", "") for agent in agents]
-            assert ends_by_agent == [END_REASONS[end] for end in ends[k]]
+            ends_by_agent = [infos[agent]["end"] for agent in agents]
+            assert ends_by_agent == ends[k].tolist()
             reasons |= set(ends_by_agent)
             if not env.agents:
                 break
         assert not env.agents
-    expected = set(end_on) | {"other_robot"} if end_on else {"", "horizon"}
+    expected = {EndReason.RUNNING, EndReason.HORIZON}
+    if end_on:
+        expected = {EndReason[name.upper()] for name in end_on} | {EndReason.OTHER_ROBOT}
     assert expected <= reasons
 
 

@@ -36,8 +36,9 @@ def test_an_adversary_sets_channels_for_each_step(disturbance):
     for k in (1, 2, 3, 4):
         infos, free = env.step(rest(env))[4], plain.step(rest(plain))[4]
         for i, agent in enumerate(env.agents):
-            found, base = infos[agent]["disturbance"], free[agent]["disturbance"]
-            assert tuple(found) == PATHS
+            found, base = (
+                {one.path: info[agent][one.key] for one in CHANNELS} for info in (infos, free)
+            )
             if k == 3:
                 assert found == base
             else:
@@ -215,8 +216,9 @@ def test_presets_run_and_tell_what_acted(name):
     infos = env.step(rest(env))[4]
     disturbance = load_scenario(disturbance=name).disturbance
     for agent in env.agents:
-        for path, value in infos[agent]["disturbance"].items():
-            low, high = disturbance.signal(path).reach()
+        for channel in CHANNELS:
+            value = infos[agent][channel.key]
+            low, high = disturbance.signal(channel.path).reach()
             assert low <= value <= high
 
 
@@ -263,4 +265,4 @@ def test_the_documentations_examples_run():
         exec(block, scope)
         env = scope["env"]
         env.reset(seed=0)
-        assert env.step(rest(env))[4]["robot_0"]["disturbance"]["slip.delta_1_mm_s"] == 20.0
+        assert env.step(rest(env))[4]["robot_0"]["slip_delta_1_mm_s"] == 20.0

@@ -14,6 +14,7 @@ import pytest
 
 import tlf_env
 from baselines import ReferencePolicy, load_policy
+from tlf_env import EndReason
 from tlf_env.envs.single import FormationEnv
 
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
@@ -110,7 +111,7 @@ def test_the_parts_hold_the_infinity(example: ModuleType, role: str, part: str) 
         actions = {agent: policy.predict(row)[0] for agent, row in seen.items()}
         seen, *_, infos = env.step(actions)
         errors.append([info["position_error_mm"] for info in infos.values()])
-    assert infos["robot_0"]["end"] == "horizon"
+    assert infos["robot_0"]["end"] == EndReason.HORIZON
     settled = np.array(errors)[len(errors) * 2 // 5 :]
     assert np.sqrt((settled**2).mean(axis=0)).max() < 10.0
 

@@ -22,6 +22,7 @@ from gymnasium.wrappers import RecordEpisodeStatistics
 
 import tlf_env
 from baselines import ReferencePolicy
+from tlf_env import EndReason
 from tlf_env.envs.single import FormationEnv
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.trajectories import sample
@@ -408,39 +409,41 @@ def test_the_horizon_truncates(learner: str) -> None:
     env = FormationEnv(learner=learner, others=Idle(), horizon_s=5.0, lost_beyond_mm=1e5)
     env.reset(seed=0)
     terminated, truncated, info = last_step(env)
-    assert (terminated, truncated, info["end"]) == (False, True, "horizon")
+    assert (terminated, truncated, info["end"]) == (False, True, EndReason.HORIZON)
     assert env.formation_env.formation.step_count == env.scenario.horizon_steps
 
 
 @pytest.mark.parametrize(
     ("learner", "end"),
-    [("robot_0", (True, False, "lost")), ("robot_1", (False, True, "other_robot"))],
+    [("robot_0", (True, False, EndReason.LOST)), ("robot_1", (False, True, EndReason.OTHER_ROBOT))],
 )
-def test_a_leader_that_stands_gets_lost(learner: str, end: tuple[bool, bool, str]) -> None:
+def test_a_leader_that_stands_gets_lost(learner: str, end: tuple[bool, bool, EndReason]) -> None:
     env = FormationEnv(learner=learner, others=Idle(), lost_beyond_mm=100.0)
     env.reset(seed=0)
     terminated, truncated, info = last_step(env)
     assert (terminated, truncated, info["end"]) == end
     assert info["lost"] == terminated
-    assert info["reward"]["lost"] == float(terminated)
+    assert info["reward_lost"] == float(terminated)
 
 
 @pytest.mark.parametrize(
     ("learner", "end"),
     [
-        ("robot_0", (True, False, "touched")),
-        ("robot_1", (True, False, "touched")),
-        ("robot_2", (False, True, "other_robot")),
+        ("robot_0", (True, False, EndReason.TOUCHED)),
+        ("robot_1", (True, False, EndReason.TOUCHED)),
+        ("robot_2", (False, True, EndReason.OTHER_ROBOT)),
     ],
 )
-def test_outlines_that_meet_end_the_episode(learner: str, end: tuple[bool, bool, str]) -> None:
+def test_outlines_that_meet_end_the_episode(
+    learner: str, end: tuple[bool, bool, EndReason]
+) -> None:
     env = FormationEnv(learner=learner, others=Idle(), lost_beyond_mm=1e5)
     # The first stands still, facing no other robot; the second is pushed into it by its start.
     env.reset(seed=0, options={"poses": [put(0, 0), put(0, -219.9), put(0, -900)]})
     terminated, truncated, info = last_step(env)
     assert (terminated, truncated, info["end"]) == end
     assert info["touched"] == terminated
-    assert info["reward"]["touched"] == float(terminated)
+    assert info["reward_touched"] == float(terminated)
 
 
 def test_a_robot_put_beyond_reach_is_lost_at_once() -> None:
@@ -448,7 +451,7 @@ def test_a_robot_put_beyond_reach_is_lost_at_once() -> None:
     _, info = env.reset(seed=0, options={"poses": [put(9e3, 0), put(0, 0), put(0, -500)]})
     assert info["position_error_mm"] > env.scenario.lost_beyond_mm
     *_, terminated, truncated, info = env.step(np.zeros(2, np.float32))
-    assert (terminated, truncated, info["end"]) == (True, False, "lost")
+    assert (terminated, truncated, info["end"]) == (True, False, EndReason.LOST)
 
 
 def test_without_ends_a_lost_and_touching_formation_goes_on() -> None:
@@ -459,7 +462,7 @@ def test_without_ends_a_lost_and_touching_formation_goes_on() -> None:
     assert not truncated
     assert info["lost"]
     assert info["touched"]
-    assert "end" not in info
+    assert info["end"] == EndReason.RUNNING
 
 
 # Reset options
@@ -499,17 +502,20 @@ def test_reset_starts_the_trajectory_at_a_phase(phase_s: Any) -> None:
         ({"phase_s": -np.inf}, "phase_s must be a finite number of seconds, got -inf"),
         ({"phase_s": "1"}, "phase_s must be a finite number of seconds, got '1'"),
         ({"phase_s": None}, "phase_s must be a finite number of seconds, got None"),
-        ({"phase_s": [1.0]}, r"phase_s must be a finite number of seconds, got \[1.0\]"),
+        (
+            {"phase_s": [1.0]},
+            r"phase_s must be a finite number of seconds, got the shape \(1,\): \[1.0\]",
+        ),
         (
             {"poses": [put(0, 0)]},
             r"poses must be 3 finite rows .* got the shape \(1, 3\): \[\[0, 0",
         ),
         ({"poses": [put(0, 0), put(0, -500), put(0, np.nan)]}, "poses must be 3 finite .* nan"),
-        ({"poses": None}, r"poses must be 3 finite rows .* got the shape \(\): None"),
-        ({"poses": "behind"}, "poses must be numbers.*'behind'"),
-        ({"poses": [[0, 0], [1]]}, "poses must be numbers"),
+        ({"poses": None}, r"poses must be 3 finite rows .* got None"),
+        ({"poses": "behind"}, "poses must be 3 finite rows .* got 'behind'"),
+        ({"poses": [[0, 0], [1]]}, r"poses must be 3 finite rows .* got \[\[0, 0\], \[1\]\]"),
         ({"poses": np.zeros((4, 3))}, r"poses must be 3 finite rows .* got the shape \(4, 3\)"),
-        ({"poses": np.array([["a"], ["b"]])}, "poses must be numbers"),
+        ({"poses": np.array([["a"], ["b"]])}, "poses must be 3 finite rows .* got array"),
     ],
 )
 def test_an_impossible_reset_option_is_named(options: dict[str, Any], message: str) -> None:

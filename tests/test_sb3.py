@@ -13,7 +13,9 @@ from stable_baselines3.common.evaluation import evaluate_policy
 from stable_baselines3.common.vec_env import VecEnvWrapper, VecMonitor, VecNormalize
 
 import tlf_env
-from baselines.sb3 import FormationVecEnv
+from baselines.sb3 import CHEAP_INFOS, FormationVecEnv
+from tlf_env import EndReason
+from tlf_env.task.info import INFO_KEYS
 
 SHORT = {"horizon_s": 2.0, "time_gap_s": 1.0, "preview_s": (0.5,)}
 ROUGH = {**SHORT, "disturbance": "combined-hard", "lost_beyond_mm": 150.0}
@@ -49,10 +51,10 @@ def test_every_robot_is_that_of_the_parallel_environment():
                 assert dones[row] == (terminated[agent] or truncated[agent])
                 if dones[row]:
                     assert infos[row]["TimeLimit.truncated"] == truncated[agent]
-                    assert infos[row]["end"] == info[agent]["end"]
                     assert np.array_equal(infos[row]["terminal_observation"], theirs[k][agent])
-                else:
-                    assert infos[row] == {}
+                assert {key: infos[row][key] for key in CHEAP_INFOS} == {
+                    key: info[agent][key] for key in CHEAP_INFOS
+                }
             if not one.agents:
                 ended += 1
                 theirs[k] = one.reset()[0]
@@ -96,6 +98,105 @@ def test_the_interface_of_vec_env():
         env.step(np.zeros((5, 2)))
     with pytest.raises(ValueError, match=r"\(6, 2\) finite numbers"):
         env.step(np.full((6, 2), "0.5"))
+
+
+@pytest.mark.parametrize("infos", [True, False, ("end", "reward_fine"), CHEAP_INFOS])
+def test_infos_have_the_same_keys_in_every_step(infos):
+    env = environment(2, infos=infos)
+    wanted = (
+        {True: set(INFO_KEYS), False: set()}.get(infos) if isinstance(infos, bool) else set(infos)
+    )
+    env.seed(0)
+    env.reset()
+    assert {frozenset(info) for info in env.reset_infos} == {frozenset(wanted)}
+    ended = 0
+    last = {"terminal_observation", "TimeLimit.truncated"}
+    for action in actions(6, 150):
+        _, _, dones, found = env.step(action)
+        ended += dones.sum()
+        for done, info in zip(dones, found, strict=True):
+            assert set(info) == (wanted | last if done else wanted)
+    assert ended > 5
+
+
+def test_the_monitor_logs_how_an_episode_ended():
+    env = VecMonitor(environment(2), info_keywords=CHEAP_INFOS)
+    env.seed(0)
+    env.reset()
+    logged = [
+        info["episode"]
+        for action in actions(6, 150)
+        for info in env.step(action)[3]
+        if "episode" in info
+    ]
+    assert {one["end"] for one in logged} > {EndReason.LOST, EndReason.OTHER_ROBOT}
+    for one in logged:
+        assert one["lost"] or one["end"] != EndReason.LOST
+        assert one["position_error_mm"] > 0.0
+
+
+def test_options_reach_the_next_reset_only():
+    poses = [[0.0, -400.0 * i, 0.1 * i] for i in range(3)]
+    options = {"phase_s": 7.3, "poses": poses}
+    env, alone = environment(2), tlf_env.parallel_env("infinity", plant="batch", **ROUGH)
+    env.seed(4)
+    env.set_options(options)
+    seen = env.reset()
+    wanted = alone.reset(seed=5, options=options)[0]
+    assert np.array_equal(seen[3:], list(wanted.values()))
+    env.seed(4)
+    assert np.array_equal(env.reset()[3:], list(alone.reset(seed=5)[0].values()))
+
+
+def test_each_formation_may_have_its_own_options():
+    poses = [[0.0, -400.0 * i, 0.1 * i] for i in range(3)]
+    each = [{}, {"phase_s": 2.5}, {"poses": poses}]
+    env, alone = environment(3), tlf_env.parallel_env("infinity", plant="batch", **ROUGH)
+    env.seed(4)
+    env.set_options([options for options in each for _ in range(3)])
+    seen = env.reset()
+    for k, options in enumerate(each):
+        wanted = alone.reset(seed=4 + k, options=options)[0]
+        assert np.array_equal(seen[3 * k : 3 * k + 3], list(wanted.values()))
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"phase": 1}, "reset option 'phase' is unknown; the options are poses, phase_s"),
+        ({"phase_s": np.inf}, "phase_s must be a finite number"),
+        ({"poses": np.zeros((2, 3))}, "poses must be 3 finite rows"),
+        ([{}] * 5, "5 mappings for 6 robots"),
+        ([{"phase_s": 1.0}] + [{}] * 5, "options differ between the robots of formation 0"),
+        ("phase_s", "options must be a mapping"),
+        ([1] * 6, "options must be a mapping"),
+    ],
+)
+def test_impossible_options_are_refused_at_once(options, says):
+    with pytest.raises(ValueError, match=says) as error:
+        environment(2).set_options(options)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.parametrize("formations", [2.5, "8", None, float("nan"), True, 0, -1])
+def test_an_impossible_number_of_formations_is_named(formations):
+    with pytest.raises(ValueError, match="formations"):
+        FormationVecEnv("infinity", formations)
+
+
+@pytest.mark.parametrize("seed", [-1, 2.5, "1", True])
+def test_an_impossible_seed_is_named(seed):
+    with pytest.raises(ValueError, match="seed"):
+        environment(2, seed=seed)
+    with pytest.raises(ValueError, match="seed"):
+        environment(2).seed(seed)
+
+
+@pytest.mark.parametrize("name", ["scenario", "place", "render_mode"])
+def test_its_own_attributes_cannot_be_set(name):
+    env = environment(2)
+    with pytest.raises(AttributeError, match=f"{name} cannot be set"):
+        env.set_attr(name, None)
 
 
 def weights(seed: int) -> list[np.ndarray]:

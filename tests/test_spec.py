@@ -6,7 +6,7 @@ from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.envs.single import FormationEnv
 from tlf_env.envs.spec import page
 from tlf_env.task.actions import ACTION_ENTRIES, ACTION_KINDS, ACTION_SIZE
-from tlf_env.task.info import INFO_MEANINGS, OTHER_INFO, Info
+from tlf_env.task.info import INFO_KEYS, INFO_MEANINGS, Info
 from tlf_env.task.observation import (
     PREVIEW_ENTRIES,
     SENSOR_TAIL_ENTRIES,
@@ -48,8 +48,7 @@ def test_class_docstrings_hold_every_name(cls):
     for name in (
         *Tracking._fields,
         *RewardTerms._fields,
-        *Info._fields,
-        *OTHER_INFO,
+        *INFO_KEYS,
         *ACTION_KINDS,
     ):
         assert f"`{name}`" in cls.__doc__

@@ -8,7 +8,8 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
-import tlf_env  # noqa: F401  registers the environments
+import tlf_env
+from tlf_env.task.info import INFO_KEYS
 
 SHORT = {"horizon_s": 5.0, "time_gap_s": 1.0, "preview_s": (0.5,), "plant": "batch"}
 ROUGH = {**SHORT, "disturbance": "combined-hard", "lost_beyond_mm": 150.0}
@@ -150,10 +151,8 @@ def test_threads_change_nothing_that_is_returned():
         for a, b in zip(rest, their_rest, strict=True):
             assert np.array_equal(a, b)
         assert infos.keys() == their_infos.keys()
-        for key in ("x_mm", "clipped", "lost", "touched", "end"):
+        for key in INFO_KEYS:
             assert np.array_equal(infos[key], their_infos[key]), key
-        for key, values in infos["reward"].items():
-            assert np.array_equal(values, their_infos["reward"][key]), key
 
 
 def test_a_returned_observation_is_not_overwritten():
@@ -207,8 +206,192 @@ def test_a_wrong_action_changes_nothing(action):
 def test_an_unknown_option_is_refused():
     with pytest.raises(ValueError, match="reset option 'pose' is unknown"):
         vector().reset(options={"pose": 1})
-    with pytest.raises(ValueError, match="'phase_s' does not exist in a vector environment"):
-        vector().reset(options={"phase_s": 1.0})
+
+
+@pytest.mark.parametrize("mode", ["NextStep", "SameStep"])
+def test_infos_and_masks_are_gymnasiums_own(mode):
+    """Every key, value, type and mask, over autoresets."""
+    one, many = vector(4, AutoresetMode(mode)), single(4, AutoresetMode(mode))
+    pairs = [(one.reset(seed=7)[1], many.reset(seed=7)[1])]
+    pairs += [(one.step(action)[-1], many.step(action)[-1]) for action in actions(4, 300)]
+    finals = 0
+    for mine, theirs in pairs:
+        assert set(mine) == set(theirs)
+        finals += "final_info" in theirs
+        for names in (mine, theirs):
+            names.update({f"final_{k}": v for k, v in names.pop("final_info", {}).items()})
+            names.pop("final_obs", None)  # objects; compared elsewhere
+        assert set(mine) == set(theirs)
+        for key, wanted in theirs.items():
+            assert np.array_equal(mine[key], wanted), key
+            assert mine[key].dtype == wanted.dtype, key
+    assert finals > 3 or mode == "NextStep"
+
+
+def test_masks_mark_what_was_reset_and_share_no_memory():
+    env = vector(5)
+    env.reset(seed=0)
+    env.step(np.full((5, 2), 0.3, np.float32))
+    mask = np.array([False, True, False, False, True])
+    _, infos = env.reset(options={"reset_mask": mask})
+    for key in INFO_KEYS:
+        assert np.array_equal(infos[f"_{key}"], mask)
+        assert not infos[key][~mask].any()
+    masks = [infos[f"_{key}"] for key in INFO_KEYS]
+    masks[0][:] = True
+    assert all(np.array_equal(one, mask) for one in masks[1:])
+    infos["x_mm"][:] = 1.0
+    assert not (infos["y_mm"] == 1.0).any()
+
+
+@pytest.mark.parametrize("infos", [False, ("end", "reward_fine", "slip_delta_1_mm_s")])
+def test_infos_may_be_left_out(infos):
+    env, full = vector(5, infos=infos), vector(5)
+    wanted = set(infos or ())
+    results = [(env.reset(seed=0), full.reset(seed=0))]
+    results += [(env.step(a), full.step(a)) for a in actions(5, 50)]
+    for mine, theirs in results:
+        assert set(mine[-1]) == wanted | {f"_{key}" for key in wanted}
+        for key, value in mine[-1].items():
+            assert np.array_equal(value, theirs[-1][key])
+        for a, b in zip(mine[:-1], theirs[:-1], strict=True):
+            assert np.array_equal(a, b)
+
+
+def test_each_sub_environment_may_start_in_its_own_way():
+    """As single environments do, with options of their own; the next episodes start as usual."""
+    count = 3
+    env = vector(count, horizon_s=1.0, time_gap_s=0.5)
+    alone = [single(1, horizon_s=1.0, time_gap_s=0.5) for _ in range(count)]
+    phases = [0.0, 11.5, -3.0]
+    poses = np.zeros((count, 3, 3))
+    poses[:, :, 1] = [0.0, -400.0, -800.0]
+    poses[:, :, 2] = np.linspace(-0.3, 0.3, 9).reshape(3, 3)
+    seen, infos = env.reset(seed=4, options={"phase_s": phases, "poses": poses})
+    theirs = [
+        one.reset(seed=4 + k, options={"phase_s": phases[k], "poses": poses[k]})
+        for k, one in enumerate(alone)
+    ]
+    for action in actions(count, 130):  # two and a half episodes
+        assert np.array_equal(seen, np.concatenate([one[0] for one in theirs]))
+        for key in INFO_KEYS:
+            assert np.array_equal(infos[key], np.concatenate([one[-1][key] for one in theirs]))
+        seen, *_, infos = env.step(action)
+        theirs = [one.step(action[k : k + 1]) for k, one in enumerate(alone)]
+
+
+@pytest.mark.parametrize("mode", MODES)
+def test_a_reset_after_the_end_takes_its_options(mode):
+    """Also where the next episode of an ended formation has started already."""
+    short = {"horizon_s": 0.4, "time_gap_s": 0.2, "preview_s": ()}
+    env, alone = vector(2, mode, **short), [single(1, mode, **short) for _ in range(2)]
+    env.reset(seed=9)
+    for k, one in enumerate(alone):
+        one.reset(seed=9 + k)
+    for action in actions(2, 20):
+        *_, truncated, _ = env.step(action)
+        for k, one in enumerate(alone):
+            one.step(action[k : k + 1])
+    assert truncated.all()
+    options = {"phase_s": 5.0}
+    seen, _ = env.reset(options=dict(options))
+    theirs = [one.reset(options=dict(options))[0] for one in alone]
+    assert np.array_equal(seen, np.concatenate(theirs))
+
+
+@pytest.mark.parametrize(
+    ("options", "says"),
+    [
+        ({"phase_s": [0.0, 1.0]}, r"phase_s must be a finite number of seconds, or that for each"),
+        ({"phase_s": np.nan}, "phase_s must be a finite number"),
+        ({"poses": np.zeros((2, 3))}, r"poses must be 3 finite rows .* got the shape \(2, 3\)"),
+        (
+            {"poses": np.zeros((4, 3, 3))},
+            r"poses must be 3 finite rows .* got the shape \(4, 3, 3\)",
+        ),
+        ({"poses": np.full((5, 3, 3), np.nan)}, "poses must be 3 finite rows"),
+        ({"speed": 1}, "reset option 'speed' is unknown; the options are poses, phase_s"),
+    ],
+)
+def test_an_impossible_option_changes_nothing(options, says):
+    env, other = vector(), vector()
+    env.reset(seed=0)
+    other.reset(seed=0)
+    with pytest.raises(ValueError, match=says) as error:
+        env.reset(options=options)
+    assert "\n" not in str(error.value)
+    good = np.zeros((5, 2), np.float32)
+    assert np.array_equal(env.step(good)[0], other.step(good)[0])
+
+
+def test_a_seed_may_be_given_to_some_only():
+    env, alone = vector(3), [single(1) for _ in range(3)]
+    env.reset(seed=[4, 5, 6])
+    for one, seed in zip(alone, (4, 5, 6), strict=True):
+        one.reset(seed=seed)
+    seen, _ = env.reset(seed=[1, None, 3])
+    theirs = [one.reset(seed=seed)[0] for one, seed in zip(alone, (1, None, 3), strict=True)]
+    assert np.array_equal(seen, np.concatenate(theirs))
+    fresh = vector(3)
+    fresh.reset(seed=[1, None, 3])
+    assert fresh.plant.seeds[0] == 1
+    assert fresh.plant.seeds[2] == 3
+
+
+def test_a_seed_seeds_np_random():
+    def draw(seed):
+        env = vector(2)
+        env.reset(seed=seed)
+        return env.np_random.random(), env.np_random_seed
+
+    assert draw(5) == draw(5) == draw(np.int64(5)) == draw([5, None])
+    assert draw(5) != draw(6)
+
+
+@pytest.mark.parametrize("steps", [1, 7, 10**6])
+def test_max_episode_steps_is_gymnasiums_time_limit(steps):
+    """As gymnasium.make shortens a single environment; a larger number changes nothing."""
+    env = vector(3, max_episode_steps=steps)
+    limited = gymnasium.make("tlf_env/Infinity-v0", max_episode_steps=steps, **ROUGH)
+    horizon = min(steps, limited.unwrapped.scenario.horizon_steps)
+    assert env.spec.max_episode_steps == env.scenario.horizon_steps == horizon
+    seen, _ = env.reset(seed=3)
+    assert np.array_equal(seen[0], limited.reset(seed=3)[0])
+    for k, action in enumerate(actions(3, 12)):
+        seen, _, terminated, truncated, _ = env.step(action)
+        one = limited.step(action[0])
+        assert np.array_equal(seen[0], one[0])
+        assert (terminated[0], truncated[0]) == one[2:4]
+        assert truncated[0] == (k + 1 == horizon)
+        if k + 1 == horizon:
+            break
+
+
+@pytest.mark.parametrize("steps", [0, -1, 2.5, True, "7"])
+def test_an_impossible_number_of_steps_is_named(steps):
+    with pytest.raises(ValueError, match=f"max_episode_steps {steps!r} must be a whole number"):
+        vector(2, max_episode_steps=steps)
+
+
+def test_the_specification_knows_the_episode():
+    env = gymnasium.make("tlf_env/Infinity-v0", **SHORT)
+    assert env.spec.max_episode_steps == 250
+    assert gymnasium.spec("tlf_env/Infinity-v0").max_episode_steps is None
+    again = gymnasium.make(env.spec)
+    assert again.spec.max_episode_steps == 250
+    assert vector(2).spec.max_episode_steps == 250
+    aware = gymnasium.wrappers.TimeAwareObservation(env)
+    assert aware.reset(seed=0)[0].shape == (env.observation_space.shape[0] + 1,)
+
+
+def test_a_scenario_cannot_be_assigned():
+    other = tlf_env.load_scenario("flower")
+    single_env = gymnasium.make("tlf_env/Infinity-v0", **SHORT).unwrapped
+    for env in (vector(2), single_env, tlf_env.parallel_env("infinity")):
+        before = env.scenario
+        with pytest.raises(AttributeError, match="scenario"):
+            env.scenario = other
+        assert env.scenario is before
 
 
 def test_a_constant_reward_is_worth_its_sum_for_ever():

@@ -18,6 +18,7 @@ def summary(record: Record) -> dict[str, Any]:
     return {
         "scenario": record.scenario.model_dump(mode="json"),
         "seed": record.seed,
+        "reset_options": record.options,
         "policy": record.policy,
         "privileged": record.scenario.privileged,
         "settle_s": record.scenario.settle_s,

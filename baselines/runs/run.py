@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -17,6 +17,7 @@ from tlf_env.onboard.parts import Factory, Policy, predicted
 from tlf_env.task.info import Info
 from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, string_metrics
 from tlf_env.task.scenario import Scenario
+from tlf_env.task.start import start_options
 
 ItemT = TypeVar("ItemT")
 
@@ -76,6 +77,7 @@ class Record:
     leader: np.ndarray  # (time, 2): the leader's reference path, mm
     lost_at_s: np.ndarray  # (robot,): when the error first passed lost_beyond_mm; infinite if never
     touched_at_s: np.ndarray  # (robot,): when it first touched another robot; infinite if never
+    options: Mapping[str, Any] | None = None  # of the reset
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.columns[column]
@@ -108,6 +110,7 @@ def run_policy(
     *,
     name: str = "policy",
     parts: Mapping[str, Factory] | None = None,
+    options: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
 ) -> Record:
     """Run a policy over the whole horizon, without early ends (``end_on=()``), and record everything.
@@ -116,17 +119,19 @@ def run_policy(
     ----------
     parts
         Factories of custom on-board parts of the scenario, if given as objects.
+    options
+        Options of the reset: ``poses`` and ``phase_s``, as of the environments.
     progress
         Called with the steps done and their total.
 
     Raises
     ------
     ValueError
-        naming the policy, if its ``predict`` does not return a pair of actions (in the right shape) and
-        a state; naming part and factory, for a part that cannot be made.
+        for an unknown or invalid option; naming the policy, if its ``predict`` does not return a pair of
+        actions (in the right shape) and a state; naming part and factory, for a part that cannot be made.
     """
     formation = Formation(scenario.model_copy(update={"end_on": ()}), parts)
-    formation.reset(checked_seed(seed))
+    formation.reset(checked_seed(seed), start=start_options(options, scenario.robot_count))
     a, steps = formation.arrays, scenario.horizon_steps
     tape = _Tape(a, steps)
     driver = _Driver(policy, scenario, a, name)
@@ -136,7 +141,8 @@ def run_policy(
         tape.note(k, scenario.control_period_s)
         if progress is not None:
             progress(k, steps)
-    return tape.record(0, scenario, seed, name)
+    plain = {name: np.asarray(value).tolist() for name, value in (options or {}).items()} or None
+    return replace(tape.record(0, scenario, seed, name), options=plain)
 
 
 def run_seeds(
@@ -232,7 +238,7 @@ class _Tape:
             policy=policy,
             t_s=np.arange(self._steps + 1) * period_s,
             columns=_with_functionals(columns, period_s),
-            leader=self._arrays.table[: self._steps + 1, :2].copy(),
+            leader=self._arrays.tables[0, : self._steps + 1, :2].copy(),
             lost_at_s=self._lost_at_s[lane],
             touched_at_s=self._touched_at_s[lane],
         )

@@ -68,7 +68,7 @@ class Moments:
 
 def lane_axes(plant: BatchPlant) -> dict[str, int]:
     """The axis that counts the lanes, for each array that has one."""
-    one, two = (make_arrays(plant.scenarios, plant.arrays.table, lanes) for lanes in (1, 2))
+    one, two = (make_arrays(plant.scenarios, plant.arrays.tables[0], lanes) for lanes in (1, 2))
     axes = {}
     for name in Arrays._fields:
         few, more = getattr(one, name).shape, getattr(two, name).shape

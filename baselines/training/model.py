@@ -25,7 +25,7 @@ def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
         if there are fewer seeds than formations.
     """
     tasks, shares = config.mixture()
-    envs = FormationVecEnv(tasks, config.formations, mixture=shares, threads=threads)
+    envs = FormationVecEnv(tasks, config.formations, mixture=shares, threads=threads, infos=False)
     first, end = config.seeds
     if end - first < config.formations:
         raise ValueError(

@@ -39,6 +39,11 @@ class Channel(NamedTuple):
     meaning: str
 
     @property
+    def key(self) -> str:
+        """Its key in an info, and its field in :class:`Effects`: the path with ``_`` for ``.``."""
+        return self.path.replace(".", "_")
+
+    @property
     def low(self) -> float:
         """The smallest value allowed."""
         return self.limits[0]
@@ -73,7 +78,7 @@ CHANNELS = (
 
 
 class Effects(NamedTuple):
-    """Values of the channels of every substep, for one robot; each field is a path with ``_`` for ``.``."""
+    """Values of the channels of every substep, for one robot, by their keys."""
 
     slip_delta_1_mm_s: float
     slip_delta_2_rad_s: float
@@ -115,7 +120,7 @@ def _check_table() -> None:
     streams = [channel.stream for channel in CHANNELS]
     if len(set(streams)) < len(streams) or min(streams) < 100:
         raise ValueError("every channel needs a stream of its own, from 100 on")
-    fields = tuple(CHANNELS[i].path.replace(".", "_") for i in numbers(SUBSTEP))
+    fields = tuple(CHANNELS[i].key for i in numbers(SUBSTEP))
     if Effects._fields != fields:
         raise ValueError(f"Effects must have the fields {fields}, has {Effects._fields}")
 

@@ -56,9 +56,10 @@ class Arrays(NamedTuple):
     # constants of the variants
     signals: np.ndarray  # (variant, channel, SignalRow)
     patches: np.ndarray  # (variant, patch, PatchRow)
-    table: np.ndarray  # (step, Reference): the leader's reference at the control steps
+    tables: np.ndarray  # (table, step, Reference): the leader's reference at the control steps
     # constants of an episode
     variants: np.ndarray  # (lane,) int64
+    routes: np.ndarray  # (lane,) int64: which of the tables the leader follows
     constants: np.ndarray  # the rows of kind CONSTANT
     levels: np.ndarray  # (lane,) of the disturbance
     # what changes
@@ -90,7 +91,7 @@ class Arrays(NamedTuple):
     touched: np.ndarray
     lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
     touched_now: np.ndarray
-    ends: np.ndarray  # (lane, robot) int8: why the episode ended in this step, as in END_REASONS
+    ends: np.ndarray  # (lane, robot) int8: why the episode ended in this step, an EndReason
     scales: np.ndarray  # (entry,) of `tracking`
     sensor_scales: np.ndarray  # (entry,) of `sensor`
     weights: np.ndarray  # (RewardTerms,)
@@ -218,8 +219,9 @@ def make_arrays(
             ]
         ),
         patches=_all_patches(scenarios),
-        table=table.copy(),
+        tables=table[None].copy(),
         variants=np.arange(lanes) % len(scenarios),
+        routes=np.zeros(lanes, dtype=np.int64),
         constants=zeros(CONSTANT_FIELDS),
         levels=np.zeros(lanes),
         states=zeros(fields_of(Kind.STATE, Kind.CONTROL)),

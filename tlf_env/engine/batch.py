@@ -20,6 +20,7 @@ from tlf_env.engine.starting import STARTED
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.scenario import Scenario, load_scenario
+from tlf_env.task.start import Start, start_options
 
 Source = str | Path | Mapping[str, Any] | Scenario
 
@@ -68,14 +69,16 @@ class BatchPlant:
         if not isinstance(scenario, Sequence) or isinstance(scenario, str):
             scenario = [scenario]
         self.scenarios = _alike([_for_lanes(source, overrides) for source in scenario])
-        self.formations = _positive("formations", formations)
-        self.threads = _positive("threads", os.cpu_count() or 1 if threads is None else threads)
+        self.formations = checked_count("formations", formations)
+        self.threads = checked_count("threads", os.cpu_count() or 1 if threads is None else threads)
         table = reference_table(self.scenario)
         self.arrays: Arrays = make_arrays(self.scenarios, table, self.formations)
         self._variants = make_variants(self.scenarios, _shares(mixture, len(self.scenarios)))
         each = [make_settings(one) for one in self.scenarios]
         self._settings = each[0]._replace(changing=any(one.changing for one in each))
         self._seeded = np.zeros(self.formations, dtype=np.bool_)
+        self._phases_s = np.zeros(1)  # of the tables of the leaders' references
+        self._poses = NO_POSES  # start poses of the present episodes, if any are given
         self._nothing = empty_excerpt(self.arrays, 0, 0)
         self._pool: ThreadPoolExecutor | None = None
 
@@ -85,45 +88,97 @@ class BatchPlant:
         return self.scenarios[0]
 
     def reset(
-        self, seed: int | Sequence[int] | None = None, mask: np.ndarray | None = None
+        self,
+        seed: int | Sequence[int | None] | None = None,
+        mask: np.ndarray | None = None,
+        options: Mapping[str, Any] | Start | None = None,
     ) -> None:
         """Start an episode in the formations of the mask.
 
         Parameters
         ----------
         seed
-            Formation k gets ``seed`` + k, or ``seed[k]`` of a sequence. Without a seed its next episode
-            begins, or the first of a random seed where there was none.
+            Formation k gets ``seed`` + k, or ``seed[k]`` of a sequence. Without a seed (None) its next
+            episode begins, or the first of a random seed where there was none.
         mask
             ``(formations,)`` bool; all if None.
+        options
+            For the episodes that this call starts: ``poses``, start poses of c at rest, ``(robots, 3)``
+            or ``(formations, robots, 3)`` in mm, mm, rad; ``phase_s``, the time on its trajectory at
+            which a leader's reference starts, one number or one for each formation. Every phase in use
+            needs a table of the reference (40 bytes a control step).
 
         Raises
         ------
         ValueError
-            for a seed out of its range, a mask of another shape, or a formation that cannot start; in
-            the last case the formations of the mask have to be reset again.
+            for a seed out of its range, a mask of another shape, an unknown or invalid option, or a
+            formation that cannot start; in the last case the formations of the mask have to be reset
+            again.
         """
-        arrays = self.arrays
         chosen = self._checked_mask(mask)
-        fresh = chosen & ~self._seeded if seed is None else chosen
+        given, seeds = self._checked_seeds(seed)
+        start = (
+            options
+            if isinstance(options, Start)
+            else start_options(options, self.scenario.robot_count, self.formations)
+        )
+        fresh = chosen & (given | ~self._seeded)
+        arrays = self.arrays
         if fresh.any():
-            if seed is None:
-                seed = secrets.randbelow(MAX_SEED - self.formations)
-            seeds = self._checked_seeds(seed)
+            if not given[fresh].all():
+                random = secrets.randbelow(MAX_SEED - self.formations) + np.arange(self.formations)
+                seeds = np.where(given, seeds, random)
             arrays.seeds[fresh] = seeds[fresh]
         arrays.clock[chosen & ~fresh, 2] += 1
         arrays.clock[fresh, 2] = 0
         self._seeded |= chosen
+        self._place(chosen, start)
         self._start(chosen)
 
-    def restart(self, mask: np.ndarray) -> None:
-        """Start the present episode of the formations of the mask, ``(formations,)`` bool, over again."""
-        self._start(self._checked_mask(mask))
+    def _place(self, chosen: np.ndarray, start: Start) -> None:
+        """Keep start poses and phases of the chosen formations' new episodes."""
+        if start.poses is not None:
+            if not len(self._poses):
+                self._poses = np.full((self.formations, self.scenario.robot_count, 3), np.nan)
+            self._poses[chosen] = start.poses[chosen]
+        elif len(self._poses):
+            self._poses[chosen] = np.nan
+        if start.phases_s is None:
+            self.arrays.routes[chosen] = 0
+            return
+        phases_s = np.where(chosen, start.phases_s, self._phases_s[self.arrays.routes])
+        later = np.unique(phases_s[phases_s != 0.0])
+        self._phases_s = np.array([0.0, *later])  # of the tables; the first has none
+        tables = [reference_table(self.scenario, phase_s) for phase_s in self._phases_s]
+        self.arrays = self.arrays._replace(tables=np.array(tables))
+        self.arrays.routes[:] = np.where(phases_s == 0.0, 0, 1 + np.searchsorted(later, phases_s))
+
+    def check_reset(
+        self, seed: int | Sequence[int | None] | None, mask: np.ndarray | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Which formations a reset would start, and which of all have a seed; both ``(formations,)`` bool.
+
+        Raises
+        ------
+        ValueError
+            for a seed out of its range, or a mask of another shape.
+        """
+        return self._checked_mask(mask), self._checked_seeds(seed)[0]
+
+    def restart(self, mask: np.ndarray, start: Start | None = None) -> None:
+        """Start the present episode of the formations of the mask, ``(formations,)`` bool, over again.
+
+        With other start poses and phases if ``start`` is given.
+        """
+        chosen = self._checked_mask(mask)
+        if start is not None:
+            self._place(chosen, start)
+        self._start(chosen)
 
     def _start(self, chosen: np.ndarray) -> None:
         arrays = self.arrays
         result, robot, lane = drivers.start(
-            arrays, self._variants, chosen, NO_POSES, self._settings
+            arrays, self._variants, chosen, self._poses, self._settings
         )
         if result != STARTED:
             why = refusal(arrays, self._variants, result, robot, lane)
@@ -224,6 +279,16 @@ class BatchPlant:
         """(formations, robots, :class:`~tlf_env.task.info.Info`)."""
         return self.arrays.infos
 
+    def info(self, key: str) -> np.ndarray:
+        """An entry of info by its key, as ``"reward_coarse"`` or ``"end"``: (formations, robots); a view.
+
+        Raises
+        ------
+        ValueError
+            for a key that info does not have.
+        """
+        return readout.info_of(self.arrays, key)
+
     @property
     def lost(self) -> np.ndarray:
         """(formations, robots) bool, at any time so far in the episode."""
@@ -246,7 +311,7 @@ class BatchPlant:
 
     @property
     def ends(self) -> np.ndarray:
-        """Why the episode ended in this step, (formations, robots), places in ``END_REASONS``."""
+        """Why the episode ended in this step, (formations, robots) int8 of :class:`~tlf_env.EndReason`."""
         return self.arrays.ends
 
     @property
@@ -297,7 +362,7 @@ class BatchPlant:
     def memory_per_formation_bytes(self) -> int:
         """Bytes per additional formation."""
         one, two = (
-            sum(array.nbytes for array in make_arrays(self.scenarios, self.arrays.table, lanes))
+            sum(array.nbytes for array in make_arrays(self.scenarios, self.arrays.tables[0], lanes))
             for lanes in (1, 2)
         )
         return two - one
@@ -312,15 +377,22 @@ class BatchPlant:
             )
         return chosen.copy()
 
-    def _checked_seeds(self, seed: int | Sequence[int]) -> np.ndarray:
+    def _checked_seeds(
+        self, seed: int | Sequence[int | None] | None
+    ) -> tuple[np.ndarray, np.ndarray]:
+        """Which formations have a seed, ``(formations,)`` bool, and the seeds."""
+        everywhere = np.ones(self.formations, dtype=np.bool_)
+        if seed is None:
+            return ~everywhere, np.zeros(self.formations, dtype=np.int64)
         if not isinstance(seed, Sequence | np.ndarray):
             first = checked_seed(seed)
             checked_seed(first + self.formations - 1)
-            return first + np.arange(self.formations)
-        seeds = [checked_seed(one) for one in seed]
-        if len(seeds) != self.formations:
-            raise ValueError(f"seed: {len(seeds)} seeds for {self.formations} formations")
-        return np.array(seeds, dtype=np.int64)
+            return everywhere, first + np.arange(self.formations)
+        if len(seed) != self.formations:
+            raise ValueError(f"seed: {len(seed)} seeds for {self.formations} formations")
+        seeds = [0 if one is None else checked_seed(one) for one in seed]
+        given = np.array([one is not None for one in seed])
+        return given, np.array(seeds, dtype=np.int64)
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_pool": None}
@@ -368,7 +440,14 @@ def _shares(mixture: bool | Sequence[float], scenarios: int) -> list[float]:
     return (weights / weights.sum()).tolist()
 
 
-def _positive(name: str, value: int) -> int:
+def checked_count(name: str, value: int) -> int:
+    """A whole number of things, at least 1.
+
+    Raises
+    ------
+    ValueError
+        naming it, for anything else.
+    """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
         raise ValueError(f"{name} {value!r} must be a whole number, at least 1")
     return int(value)

@@ -17,15 +17,15 @@ class Excerpt(NamedTuple):
     """Written by the thread that steps a lane, while the lane's numbers are in its cache."""
 
     robot: int
-    numbers: np.ndarray  # (row, lane): Info, RewardTerms, the channels, reward, lost, touched, end
+    numbers: np.ndarray  # (row, lane): the infos, as in INFO_KEYS, then the reward
     observations: np.ndarray  # (lane, entry); (0, entry) if nothing is to be written
 
 
-# First rows: infos from 0, then the reward terms, the channels, and single rows.
+# Rows: those of INFO_KEYS (Info, the reward terms, the channels, three flags), then the reward.
 TERMS_ROW = len(Info._fields)
 APPLIED_ROW = TERMS_ROW + len(RewardTerms._fields)
-REWARD_ROW = APPLIED_ROW + len(CHANNELS)
-LOST_ROW, TOUCHED_ROW, END_ROW, EXCERPT_ROWS = range(REWARD_ROW + 1, REWARD_ROW + 5)
+LOST_ROW = APPLIED_ROW + len(CHANNELS)
+TOUCHED_ROW, END_ROW, REWARD_ROW = range(LOST_ROW + 1, LOST_ROW + 4)
 
 
 def empty_excerpt(arrays: Arrays, robot: int, lanes: int) -> Excerpt:
@@ -35,7 +35,7 @@ def empty_excerpt(arrays: Arrays, robot: int, lanes: int) -> Excerpt:
         if arrays.sensor_observations.shape[2] > 0
         else arrays.observations
     )
-    numbers = np.empty((EXCERPT_ROWS, padded(lanes)))
+    numbers = np.empty((REWARD_ROW + 1, padded(lanes)))
     return Excerpt(robot, numbers, np.empty((lanes, shown.shape[2]), dtype=shown.dtype))
 
 
@@ -58,10 +58,10 @@ def write_excerpt(arrays: Arrays, first: int, last: int, out: Excerpt) -> None:
             numbers[i, lane] = arrays.infos[lane, robot, i]
         for i in range(APPLIED_ROW - TERMS_ROW):
             numbers[TERMS_ROW + i, lane] = arrays.terms[lane, robot, i]
-        numbers[REWARD_ROW, lane] = arrays.rewards[lane, robot]
         numbers[LOST_ROW, lane] = arrays.lost[lane, robot]
         numbers[TOUCHED_ROW, lane] = arrays.touched[lane, robot]
         numbers[END_ROW, lane] = arrays.ends[lane, robot]
-    for i in range(REWARD_ROW - APPLIED_ROW):
+        numbers[REWARD_ROW, lane] = arrays.rewards[lane, robot]
+    for i in range(LOST_ROW - APPLIED_ROW):
         for lane in range(first, last):
             numbers[APPLIED_ROW + i, lane] = arrays.applied[i, robot, lane]

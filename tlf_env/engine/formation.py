@@ -29,6 +29,7 @@ from tlf_env.physics.pymunk_plant import PymunkPlant
 from tlf_env.physics.vehicle import Body
 from tlf_env.task.info import Info
 from tlf_env.task.scenario import Scenario
+from tlf_env.task.start import Start
 from tlf_env.task.trajectories import sample
 
 
@@ -44,8 +45,9 @@ STATE_SCALES = np.array(
 )
 
 
+USUAL_START = Start(poses=None, phases_s=None)
 ALONE = np.ones(1, dtype=np.bool_)
-NO_POSES = np.zeros((0, 3))
+NO_POSES = np.zeros((0, 0, 3))
 
 
 class Formation:
@@ -86,20 +88,19 @@ class Formation:
         self,
         seed: int,
         episode: int = 0,
-        poses: np.ndarray | None = None,
-        phase_s: float = 0.0,
+        start: Start = USUAL_START,
     ) -> None:
         """Put all robots at their start, at rest, and take the first observation.
 
-        ``poses`` ``(robot, 3)`` (mm, mm, rad) replaces the start poses of c; ``phase_s`` starts the
-        leader's reference that much later on its trajectory.
+        ``start`` may replace the start poses of c, and start the leader's reference later on its
+        trajectory.
         """
         arrays, settings = self.arrays, self._settings
         arrays.clock[0], arrays.seeds[0] = (0, 0, episode), seed
-        arrays.table[:] = reference_table(self.scenario, phase_s) if phase_s else self._table
-        result, robot, _ = drivers.start(
-            arrays, self._variants, ALONE, NO_POSES if poses is None else poses, settings
-        )
+        phase_s = 0.0 if start.phases_s is None else float(start.phases_s[0])
+        arrays.tables[0] = reference_table(self.scenario, phase_s) if phase_s else self._table
+        poses = NO_POSES if start.poses is None else start.poses
+        result, robot, _ = drivers.start(arrays, self._variants, ALONE, poses, settings)
         if result != STARTED:
             raise ValueError(refusal(arrays, self._variants, result, robot))
         self.plant.reset(arrays.rows("body")[:, :, 0])
@@ -206,7 +207,7 @@ class Formation:
 
     def leader_path(self) -> np.ndarray:
         """The leader's whole reference path, ``(step, 2)``, mm; a view."""
-        return self.arrays.table[:, :2]
+        return self.arrays.tables[0, :, :2]
 
 
 def refusal(arrays: Arrays, of: Variants, result: int, robot: int, lane: int = 0) -> str:

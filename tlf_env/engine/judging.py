@@ -145,7 +145,8 @@ def wanted_of_formation(
 ) -> tuple[float, float]:
     """A robot's place by the leader's reference, ref(t − robot·gap); ref(0) before the start; mm."""
     substep = max(step - robot * gap, 0)
-    return arrays.table[substep, 0], arrays.table[substep, 1]
+    route = arrays.routes[lane]
+    return arrays.tables[route, substep, 0], arrays.tables[route, substep, 1]
 
 
 @law

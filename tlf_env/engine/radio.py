@@ -112,7 +112,7 @@ def next_reference(arrays: Arrays, lane: int, robot: int, step: int, settings: S
     slot = step % arrays.references.shape[1]
     if robot == 0:
         for i in range(5):
-            arrays.references[i, slot, robot, lane] = arrays.table[step, i]
+            arrays.references[i, slot, robot, lane] = arrays.tables[arrays.routes[lane], step, i]
         return
     delayed = delayed_message(arrays, lane, robot, step, settings)
     x, y, theta = read_observer(arrays.states, robot, lane)

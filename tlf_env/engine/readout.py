@@ -6,9 +6,15 @@ from typing import Any
 
 import numpy as np
 
+from tlf_env.disturbances.channels import CHANNELS
 from tlf_env.engine.arrays import Arrays
 from tlf_env.onboard.observer import Reference
-from tlf_env.task.info import Info, State
+from tlf_env.task.info import INFO_KEYS, Info, State, check_key
+from tlf_env.task.reward import RewardTerms
+
+FIRST_TERM = len(Info._fields)
+FIRST_CHANNEL = FIRST_TERM + len(RewardTerms._fields)
+FIRST_FLAG = FIRST_CHANNEL + len(CHANNELS)
 
 
 def named(arrays: Arrays, name: str) -> Any:
@@ -26,6 +32,43 @@ def named(arrays: Arrays, name: str) -> Any:
 def info(arrays: Arrays) -> Any:
     """:class:`~tlf_env.task.info.Info` of the last step, each field ``(formation, robot)``; views."""
     return Info(*np.moveaxis(arrays.infos, 2, 0))
+
+
+def info_of(arrays: Arrays, key: str) -> np.ndarray:
+    """An entry of info by its key, ``(formation, robot)``; a view.
+
+    Raises
+    ------
+    ValueError
+        for a key that info does not have.
+    """
+    check_key(key)
+    place = INFO_KEYS.index(key)
+    if place < FIRST_TERM:
+        return arrays.infos[:, :, place]
+    if place < FIRST_CHANNEL:
+        return arrays.terms[:, :, place - FIRST_TERM]
+    if place < FIRST_FLAG:
+        return arrays.applied[place - FIRST_CHANNEL, :, : len(arrays.seeds)].T
+    flags = {"lost": arrays.lost, "touched": arrays.touched, "end": arrays.ends}
+    return flags[key]
+
+
+def info_rows(arrays: Arrays, lane: int = 0) -> list[tuple[float, ...]]:
+    """The infos of a formation's robots, each a tuple in the order of ``INFO_KEYS``."""
+    rows = zip(
+        arrays.infos[lane].tolist(),
+        arrays.terms[lane].tolist(),
+        arrays.applied[:, :, lane].T.tolist(),
+        arrays.lost[lane].tolist(),
+        arrays.touched[lane].tolist(),
+        arrays.ends[lane].tolist(),
+        strict=True,
+    )
+    return [
+        (*info, *terms, *applied, lost, touched, end)
+        for info, terms, applied, lost, touched, end in rows
+    ]
 
 
 def reference(arrays: Arrays) -> Any:

@@ -130,7 +130,9 @@ def outlines_apart(arrays: Arrays, lane: int, robot: int, other: int) -> bool:
 @block
 def line_up(arrays: Arrays, lane: int, settings: Settings) -> None:
     """Start poses of c: the leader on its reference, the others behind it on its tangent."""
-    x, y, theta = arrays.table[0, 0], arrays.table[0, 1], arrays.table[0, 2]
+    route = arrays.routes[lane]
+    x, y = arrays.tables[route, 0, 0], arrays.tables[route, 0, 1]
+    theta = arrays.tables[route, 0, 2]
     for robot in range(arrays.states.shape[1]):
         behind = settings.spacing * robot
         pose = Pose(x + behind * math.sin(theta), y - behind * math.cos(theta), theta)
@@ -207,8 +209,9 @@ def begin(arrays: Arrays, lane: int, settings: Settings) -> None:
 def start_lane(
     arrays: Arrays, of: Variants, lane: int, poses: np.ndarray, settings: Settings
 ) -> tuple[int, int]:
-    """Start the episode of a lane's seed and number; ``poses`` (robot, 3) if given, else without rows.
+    """Start the episode of a lane's seed and number.
 
+    ``poses`` ``(lane, robot, 3)``, NaN in lanes whose poses are drawn; without rows if they all are.
     Returns ``STARTED``, or ``OFF_BASE`` or ``NO_ROOM`` and the robot.
     """
     clear_lane(arrays, lane)
@@ -219,9 +222,9 @@ def start_lane(
     for robot in range(robots):
         if not load_robot(arrays, lane, robot):
             return OFF_BASE, robot
-    if poses.shape[0] > 0:
+    if poses.shape[0] > 0 and not math.isnan(poses[lane, 0, 0]):
         for robot in range(robots):
-            pose = Pose(poses[robot, 0], poses[robot, 1], poses[robot, 2])
+            pose = Pose(poses[lane, robot, 0], poses[lane, robot, 1], poses[lane, robot, 2])
             write_start(arrays.states, robot, lane, pose)
     else:
         line_up(arrays, lane, settings)

@@ -5,8 +5,7 @@ from __future__ import annotations
 import secrets
 import sys
 import warnings
-from collections.abc import Callable, Mapping
-from numbers import Real
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -17,23 +16,22 @@ from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from tlf_env.disturbances.channels import PATHS
 from tlf_env.disturbances.model import PatchRow, patch_rows
 from tlf_env.engine.formation import STATE_SCALES, Formation
 from tlf_env.engine.judging import terminated, truncated
+from tlf_env.engine.readout import info_rows
 from tlf_env.envs.spec import documented
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import Factory, part_name, real_numbers
 from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.info import END_REASONS, Info, State
+from tlf_env.task.info import INFO_KEYS, InfoChoice, State, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
-from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
+from tlf_env.task.start import start_options
 
 Agent = str
 Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
-START_POSE_LIMIT_MM = 1e9
 PETTINGZOO_TEST_OPTION = "options"  # PettingZoo's API test passes this option; it is ignored
 
 
@@ -76,6 +74,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     adversary
         Called with the environment before every step; returns ``{channel: value or one per robot}`` to
         apply in that step, e.g. ``{"slip.delta_1_mm_s": 20.0}``.
+    infos
+        Whether :meth:`reset` and :meth:`step` return infos; or a sequence of the keys to return.
     **overrides
         Fields of the scenario; ``disturbance_level`` too.
 
@@ -91,6 +91,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         *,
         render_mode: str | None = None,
         adversary: Adversary | None = None,
+        infos: InfoChoice = True,
         **overrides: Any,
     ) -> None:
         overrides, parts = separate_parts(overrides)
@@ -98,7 +99,9 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             if not callable(adversary):
                 raise ValueError(f"adversary {adversary!r} must be callable with the environment")
             overrides["adversary"] = True
-        self.scenario = load_scenario(scenario, **overrides)
+        self._info_keys = chosen_keys(infos)
+        self._pick = [INFO_KEYS.index(key) for key in self._info_keys]
+        self._scenario = load_scenario(scenario, **overrides)
         for line in scenario_warnings(self.scenario):
             warnings.warn(line, ReferenceWarning, stacklevel=callers_level())
         self.metadata: dict[str, Any] = {
@@ -143,6 +146,11 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return self._np_random
 
     @property
+    def scenario(self) -> Scenario:
+        """Everything that an episode depends on, except the seed."""
+        return self._scenario
+
+    @property
     def formation(self) -> Formation:
         """The simulation behind the environment; policies must not use its true state."""
         return self._formation
@@ -181,7 +189,10 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         ImportError
             in mode ``human`` without pygame.
         """
-        poses, phase_s = start_options(options or {}, self.scenario.robot_count)
+        given = options
+        if isinstance(options, Mapping):
+            given = {k: v for k, v in options.items() if k != PETTINGZOO_TEST_OPTION}
+        start = start_options(given, self.scenario.robot_count)
         if seed is not None:
             self._seed, self._episode = checked_seed(seed), 0
             self._np_random = None
@@ -189,7 +200,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             self._seed, self._episode = secrets.randbelow(MAX_SEED), 0
         else:
             self._episode += 1
-        self._formation.reset(self._seed, self._episode, poses, phase_s)
+        self._formation.reset(self._seed, self._episode, start)
         if self._renderer is not None:
             self._renderer.begin(self._path_mm())
         if self.render_mode == "human":
@@ -231,11 +242,11 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self._formation.step()
         a = self._formation.arrays
         rewards = dict(zip(self.agents, a.rewards[0].tolist(), strict=True))
-        ended, cut, ends = self._ends()
+        over = a.ends[0].any()
+        ended = dict(zip(self.agents, terminated(a.ends[0]).tolist(), strict=True))
+        cut = dict(zip(self.agents, truncated(a.ends[0]).tolist(), strict=True))
         observations, infos = self._observations(), self._infos()
-        if ends:
-            for agent, reason in ends.items():
-                infos[agent]["end"] = reason
+        if over:
             self.agents = []
         if self.render_mode == "human":
             self._draw(self.render_mode)
@@ -268,15 +279,6 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         what = f"{unknown[0]!r} is not an agent" if unknown else f"no action for {missing[0]}"
         raise ValueError(f"{what}; the agents are {', '.join(self.agents)}")
 
-    def _ends(self) -> tuple[dict[Agent, bool], dict[Agent, bool], dict[Agent, str]]:
-        ends = self._formation.arrays.ends[0]
-        reasons = zip(self.agents, ends.tolist(), strict=True)
-        return (
-            dict(zip(self.agents, terminated(ends).tolist(), strict=True)),
-            dict(zip(self.agents, truncated(ends).tolist(), strict=True)),
-            {agent: END_REASONS[end] for agent, end in reasons if end},
-        )
-
     def _seen(self) -> np.ndarray:
         a = self._formation.arrays
         sensor = self.scenario.observation == "sensor"
@@ -287,23 +289,14 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return dict(zip(self.possible_agents, fresh, strict=True))
 
     def _infos(self) -> dict[Agent, dict[str, Any]]:
-        a = self._formation.arrays
-        infos: dict[Agent, dict[str, Any]] = {}
-        for agent, applied, values, terms, lost, touched in zip(
-            self.possible_agents,
-            self._formation.applied().tolist(),
-            a.infos[0].tolist(),
-            a.terms[0].tolist(),
-            a.lost[0].tolist(),
-            a.touched[0].tolist(),
-            strict=True,
-        ):
-            info: dict[str, Any] = dict(zip(Info._fields, values, strict=True))
-            info["reward"] = dict(zip(RewardTerms._fields, terms, strict=True))
-            info["disturbance"] = dict(zip(PATHS, applied, strict=True))
-            info["lost"], info["touched"] = lost, touched
-            infos[agent] = info
-        return infos
+        keys, pick = self._info_keys, self._pick
+        if not keys:
+            return {agent: {} for agent in self.possible_agents}
+        rows: Sequence[Sequence[float]] = info_rows(self._formation.arrays)
+        if len(keys) < len(INFO_KEYS):
+            rows = [[row[i] for i in pick] for row in rows]
+        named = [dict(zip(keys, row, strict=True)) for row in rows]
+        return dict(zip(self.possible_agents, named, strict=True))
 
     def state(self) -> np.ndarray:
         """The true state for critics, float32: scaled :class:`tlf_env.task.info.State` of every robot."""
@@ -369,51 +362,18 @@ def separate_parts(overrides: dict[str, Any]) -> tuple[dict[str, Any], dict[str,
     return {**overrides, **{role: part_name(part) for role, part in parts.items()}}, parts
 
 
-def start_options(options: dict[str, Any], robots: int) -> tuple[np.ndarray | None, float]:
-    """The start poses, if any, and the phase (s) in the options of ``reset``.
-
-    Raises
-    ------
-    ValueError
-        for an unknown option or an invalid value.
-    """
-    unknown = sorted(set(options) - {"poses", "phase_s", PETTINGZOO_TEST_OPTION})
-    if unknown:
-        raise ValueError(f"reset option {unknown[0]!r} is unknown; the options are poses, phase_s")
-    phase_s = options.get("phase_s", 0.0)
-    if (
-        isinstance(phase_s, bool)
-        or not isinstance(phase_s, Real)
-        or not np.isfinite(float(phase_s))
-    ):
-        raise ValueError(
-            f"reset option phase_s must be a finite number of seconds, got {phase_s!r}"
-        )
-    if "poses" not in options:
-        return None, float(phase_s)
-    try:
-        poses = np.asarray(options["poses"], dtype=np.float64)
-    except (TypeError, ValueError) as error:
-        why = " ".join(f"{error}, got {options['poses']!r}".split())
-        raise ValueError(f"reset option poses must be numbers: {why}") from error
-    if poses.shape != (robots, 3) or not (np.abs(poses) <= START_POSE_LIMIT_MM).all():
-        raise ValueError(
-            f"reset option poses must be {robots} finite rows (x mm, y mm, θ rad) "
-            f"within ±{START_POSE_LIMIT_MM:g}, "
-            f"got the shape {poses.shape}: {' '.join(repr(options['poses']).split())}"
-        )
-    return poses, float(phase_s)
-
-
 def parallel_env(
     scenario: str | Path | Mapping[str, Any] | Scenario = "infinity",
     *,
     render_mode: str | None = None,
     adversary: Adversary | None = None,
+    infos: InfoChoice = True,
     **overrides: Any,
 ) -> FormationParallelEnv:
     """Make the parallel environment; see :class:`FormationParallelEnv`."""
-    return FormationParallelEnv(scenario, render_mode=render_mode, adversary=adversary, **overrides)
+    return FormationParallelEnv(
+        scenario, render_mode=render_mode, adversary=adversary, infos=infos, **overrides
+    )
 
 
 def aec_env(

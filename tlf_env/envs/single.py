@@ -2,21 +2,33 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.envs.spec import documented
 from tlf_env.onboard.parts import Policy, load_part, make_part, predicted
 from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE, TWIST
+from tlf_env.task.info import InfoChoice
 from tlf_env.task.scenario import Scenario
 
 BY_REFERENCE = "reference"
+
+
+def with_length(spec: EnvSpec | None, scenario: Scenario) -> EnvSpec | None:
+    """A copy of Gymnasium's specification whose ``max_episode_steps`` is the scenario's horizon."""
+    if spec is None:
+        return None
+    changed = copy.deepcopy(spec)
+    changed.max_episode_steps = scenario.horizon_steps
+    return changed
 
 
 @documented
@@ -42,6 +54,8 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     render_mode
         None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, updated by every
         :meth:`reset` and :meth:`step`, at most in real time).
+    infos
+        Whether :meth:`reset` and :meth:`step` return infos; or a sequence of the keys to return.
     **overrides
         Fields of the scenario; ``disturbance_level`` too.
 
@@ -60,9 +74,13 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         learner: str | None = None,
         others: str | Policy = BY_REFERENCE,
         render_mode: str | None = None,
+        infos: InfoChoice = True,
         **overrides: Any,
     ) -> None:
-        self.formation_env = FormationParallelEnv(scenario, render_mode=render_mode, **overrides)
+        self.formation_env = FormationParallelEnv(
+            scenario, render_mode=render_mode, infos=infos, **overrides
+        )
+        self._spec: EnvSpec | None = None
         agents = self.formation_env.possible_agents
         if learner is None:
             learner = agents[min(1, len(agents) - 1)]
@@ -102,6 +120,15 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def scenario(self) -> Scenario:
         """Everything that an episode depends on, except the seed."""
         return self.formation_env.scenario
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's specification, with the steps of an episode; None without ``gymnasium.make``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = with_length(value, self.scenario)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

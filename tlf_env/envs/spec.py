@@ -11,7 +11,7 @@ from typing import TypeVar
 
 from tlf_env.task.actions import ACTION_ENTRIES
 from tlf_env.task.feasibility import SENSOR_FIX_LIMIT_MM, SENSOR_START_LIMIT_MM, SENSOR_TIME_LIMIT_S
-from tlf_env.task.info import INFO_MEANINGS, OTHER_INFO
+from tlf_env.task.info import MEANINGS
 from tlf_env.task.observation import (
     OBSERVATION_LIMIT,
     PREVIEW_ENTRIES,
@@ -99,8 +99,12 @@ def reward_section() -> str:
 
 def info_section() -> str:
     """Section on the entries of info."""
-    rows = [(f"`{name}`", meaning) for name, meaning in (INFO_MEANINGS | OTHER_INFO).items()]
-    return table(("key", "meaning"), rows)
+    rows = [(f"`{name}`", meaning) for name, meaning in MEANINGS.items()]
+    return (
+        "One number or flag for each key; the same keys in `reset` and in every step. `infos=False` returns "
+        "empty infos,\nand a sequence of keys returns only these, which saves time.\n\n"
+        + table(("key", "meaning"), rows)
+    )
 
 
 SECTIONS = {
@@ -130,12 +134,14 @@ each of its fields is a keyword argument.
 
 An episode ends for the whole formation at once. `lost`: the true error to the robot's own reference
 exceeded `lost_beyond_mm`. `touched`: two outlines (circles) met. Each of them ends the episode if it is in
-`end_on`: the robots concerned are terminated, the others are truncated with `info["end"] = "other_robot"`,
-so that a learner bootstraps for robots that did not fail. The horizon truncates all robots.
+`end_on`: the robots concerned are terminated, the others are truncated with
+`info["end"] == tlf_env.EndReason.OTHER_ROBOT`, so that a learner bootstraps for robots that did not fail. The
+horizon truncates all robots.
 
 `reset(seed=..., options={"poses": (n, 3) in mm, mm, rad, "phase_s": seconds})` sets the start poses and the
-time on its trajectory at which the leader's reference starts. Heading 0 points along +y, and positive turns
-are counter-clockwise (in ROS REP-103, heading 0 points along +x). `state()` is the true state, for critics.
+time on its trajectory at which the leader's reference starts, for that episode only. Heading 0 points along
++y, and positive turns are counter-clockwise (in ROS REP-103, heading 0 points along +x). `state()` is the true
+state, for critics.
 
 ## Many formations
 
@@ -149,10 +155,14 @@ single environments.
   seed s + k. The modes `NextStep`, `SameStep` (`final_obs`, `final_info`) and `Disabled`
   (`reset(options={"reset_mask": mask})`) are those of Gymnasium.
 - `baselines.sb3.FormationVecEnv("infinity", formations=256, threads=1, **fields)`: the `VecEnv` of
-  stable-baselines3. Every robot is a sub-environment; robot i of formation k has index k·n + i.
+  stable-baselines3. Every robot is a sub-environment; robot i of formation k has index k·n + i. Its infos
+  contain `position_error_mm`, `lost`, `touched` and `end`; `infos=True` gives all keys. That nearly doubles
+  the time of a step, because SB3 takes a dictionary for each robot.
   `terminal_observation` and `TimeLimit.truncated` indicate where to bootstrap: robots whose episode was
   ended by another robot are truncated. Several tasks with any numbers of robots:
   `FormationVecEnv({"infinity": [...], "flower": "flower"})`.
+- `reset` of all of them takes the options `poses` and `phase_s`, for all formations or one for each; in the
+  `VecEnv`, `set_options` sets them for the next `reset`.
 - With a sequence of scenarios and `mixture=True` or shares, every episode draws its scenario (domain
   randomisation).
 """

@@ -2,56 +2,30 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+import functools
+from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
+from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from tlf_env.disturbances.channels import PATHS
 from tlf_env.engine import judging
-from tlf_env.engine.batch import BatchPlant
-from tlf_env.engine.excerpt import (
-    APPLIED_ROW,
-    END_ROW,
-    LOST_ROW,
-    REWARD_ROW,
-    TERMS_ROW,
-    TOUCHED_ROW,
-    Excerpt,
-)
-from tlf_env.envs.parallel import start_options
-from tlf_env.envs.single import BY_REFERENCE
+from tlf_env.engine.batch import BatchPlant, checked_count
+from tlf_env.engine.excerpt import END_ROW, REWARD_ROW, Excerpt
+from tlf_env.envs.single import BY_REFERENCE, with_length
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE
-from tlf_env.task.info import END_REASONS, Info
+from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
-from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario
+from tlf_env.task.start import start_options
 
 RESET_MASK = "reset_mask"
-REASONS = np.array(END_REASONS)
-
-
-class Names(NamedTuple):
-    """Keys of Gymnasium's infos, and of the masks of their sub-environments."""
-
-    keys: tuple[str, ...]
-    masks: tuple[str, ...]
-
-
-INFO, REWARDS, DISTURBANCE, OTHERS = (
-    Names(tuple(keys), tuple(f"_{key}" for key in keys))
-    for keys in (
-        Info._fields,
-        RewardTerms._fields,
-        PATHS,
-        ("reward", "disturbance", "lost", "touched"),
-    )
-)
 
 
 class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -77,6 +51,10 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         True, or a share for each scenario: every episode draws its scenario.
     autoreset_mode
         ``NextStep`` (Gymnasium's default), ``SameStep`` or ``Disabled``.
+    max_episode_steps
+        Shortens the scenario's ``horizon_s`` to so many control steps, if it is longer.
+    infos
+        Whether steps return infos; or a sequence of the keys to return.
     render_mode
         None.
     **overrides
@@ -99,10 +77,23 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         mixture: bool | Sequence[float] = False,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
+        max_episode_steps: int | None = None,
+        infos: InfoChoice = True,
         **overrides: Any,
     ) -> None:
-        self.plant = BatchPlant(scenario, num_envs, threads=threads, mixture=mixture, **overrides)
-        self.scenario = self.plant.scenario
+        make = functools.partial(
+            BatchPlant, scenario, num_envs, threads=threads, mixture=mixture, **overrides
+        )
+        self.plant = make()
+        if max_episode_steps is not None:
+            steps = checked_count("max_episode_steps", max_episode_steps)
+            if steps < self.plant.scenario.horizon_steps:
+                self.plant = make(horizon_s=steps * self.plant.scenario.control_period_s)
+        self._info_keys = chosen_keys(infos)
+        self._mask_keys = [f"_{key}" for key in self._info_keys]
+        self._info_rows = [INFO_KEYS.index(key) for key in self._info_keys]
+        flags = {"lost": np.bool_, "touched": np.bool_, "end": np.int64}
+        self._flags = {key: dtype for key, dtype in flags.items() if key in self._info_keys}
         robots = self.scenario.robot_count
         agents = [f"robot_{i}" for i in range(robots)]
         learner = agents[min(1, robots - 1)] if learner is None else learner
@@ -137,39 +128,65 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self._actions = np.zeros((self.num_envs, robots, ACTION_SIZE))
         self._over = np.zeros(self.num_envs, dtype=np.bool_)  # ended and not restarted
 
+    @property
+    def scenario(self) -> Scenario:
+        """Everything that an episode depends on, except the seed; of several scenarios, the first."""
+        return self.plant.scenario
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's specification, with the steps of an episode; None without ``make_vec``."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = with_length(value, self.scenario)
+
     def reset(
         self,
         *,
-        seed: int | Sequence[int] | None = None,
+        seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[np.ndarray, dict[str, Any]]:
         """Start an episode in all formations, or in those of ``options["reset_mask"]``.
 
-        The seed of sub-environment k is ``seed`` + k, or ``seed[k]``; None starts its next episode. Other
-        options are not supported here.
+        Parameters
+        ----------
+        seed
+            The seed of sub-environment k is ``seed`` + k, or ``seed[k]``; None starts its next episode.
+        options
+            ``reset_mask``: ``(num_envs,)`` bool; ``poses`` and ``phase_s``: as in
+            :meth:`~tlf_env.engine.batch.BatchPlant.reset`, for the episodes that this call starts.
+
+        Returns
+        -------
+        The observations of all formations, and the infos of those that were reset: elsewhere the masks
+        are False and the values 0.
 
         Raises
         ------
         ValueError
-            for a seed out of its range, a mask of another shape, or another option.
+            for a seed out of its range, a mask of another shape, or an unknown or invalid option.
         """
         options = dict(options or {})
         mask = options.pop(RESET_MASK, None)
-        start_options(options, self.scenario.robot_count)
-        if options:
-            raise ValueError(
-                f"reset option {next(iter(options))!r} does not exist in a vector environment; the "
-                f"only option is {RESET_MASK}"
-            )
-        begun = self._begun(mask) if seed is None else np.zeros_like(self._over)
-        if begun.any():  # their next episode has started already
-            self.plant.restart(begun)
-            mask = ~begun if mask is None else mask & ~begun
-        self.plant.reset(seed, mask)
-        self._over &= ~(np.ones_like(begun) if mask is None else mask | begun)
+        start = start_options(options, self.scenario.robot_count, self.num_envs)
+        chosen, given = self.plant.check_reset(seed, mask)
+        # With NextStep, the next episode of a formation that ended has started already.
+        begun = chosen & ~given & self._over
+        if self.autoreset_mode is not AutoresetMode.NEXT_STEP:
+            begun[:] = False
+        if begun.any():
+            self.plant.restart(begun, start)
+        self.plant.reset(seed, chosen & ~begun, start)
+        if seed is not None:
+            seeds = seed if isinstance(seed, Sequence | np.ndarray) else [seed]
+            first = next((int(one) for one in seeds if one is not None), None)
+            self._np_random, self._np_random_seed = seeding.np_random(first)
+        self._over &= ~chosen
         seen = self.plant.excerpt(self._robot)
         self.plant.write_excerpt(seen)
-        return seen.observations, self._infos(seen)
+        return seen.observations, self._infos(seen, None if mask is None else chosen)
 
     def step(
         self, actions: np.ndarray
@@ -211,20 +228,14 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         ends = self._ends(seen)
         terminated, truncated = judging.terminated(ends), judging.truncated(ends)
         self._over = terminated | truncated
-        infos = self._infos(seen)
         if self._over.any() and self.autoreset_mode is not AutoresetMode.DISABLED:
             self.plant.reset(mask=self._over)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
-                seen, infos = self._begin_again(seen, infos)
-        return seen.observations, rewards, terminated, truncated, infos
+                seen, infos = self._begin_again(seen)
+                return seen.observations, rewards, terminated, truncated, infos
+        return seen.observations, rewards, terminated, truncated, self._infos(seen)
 
-    def _begun(self, mask: np.ndarray | None) -> np.ndarray:
-        """The formations of the mask that have ended and are already restarted for the next step."""
-        if self.autoreset_mode is not AutoresetMode.NEXT_STEP:
-            return np.zeros_like(self._over)
-        return self._over if mask is None else self._over & mask
-
-    def _begin_again(self, last: Excerpt, infos: dict[str, Any]) -> tuple[Excerpt, dict[str, Any]]:
+    def _begin_again(self, last: Excerpt) -> tuple[Excerpt, dict[str, Any]]:
         """Excerpt and infos of the new episodes, with the final ones of the ended episodes."""
         seen = Excerpt(last.robot, last.numbers.copy(), last.observations.copy())
         self.plant.write_excerpt(seen, self._over)
@@ -233,33 +244,31 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             final[k] = last.observations[k]
         fresh = self._infos(seen)
         fresh |= {"final_obs": final, "_final_obs": self._over.copy()}
-        fresh |= {"final_info": infos, "_final_info": self._over.copy()}
+        fresh |= {"final_info": self._infos(last, self._over), "_final_info": self._over.copy()}
         self._over[:] = False
         return seen, fresh
 
     def _ends(self, seen: Excerpt) -> np.ndarray:
         return seen.numbers[END_ROW, : self.num_envs].astype(np.int8)
 
-    def _infos(self, seen: Excerpt) -> dict[str, Any]:
-        """Infos in Gymnasium's form: for each key an array over the sub-environments and a mask ``_key``."""
-        rows, ends = seen.numbers[:, : self.num_envs], self._ends(seen)
-        everywhere = np.ones(self.num_envs, dtype=np.bool_)
+    def _infos(self, seen: Excerpt, of: np.ndarray | None = None) -> dict[str, Any]:
+        """Infos in Gymnasium's form: for each key an array over the sub-environments and a mask ``_key``.
 
-        def named(names: Names, values: Iterable[Any]) -> dict[str, Any]:
-            columns = dict(zip(names.keys, values, strict=True))
-            columns.update(dict.fromkeys(names.masks, everywhere))
-            return columns
-
-        infos = named(INFO, rows[:TERMS_ROW])
-        terms, channels = (
-            named(REWARDS, rows[TERMS_ROW:APPLIED_ROW]),
-            named(DISTURBANCE, rows[APPLIED_ROW:REWARD_ROW]),
-        )
-        infos |= named(OTHERS, (terms, channels, rows[LOST_ROW] != 0, rows[TOUCHED_ROW] != 0))
-        ended = ends != 0
-        reasons = np.zeros(self.num_envs, REASONS.dtype)
-        reasons[ended] = REASONS[ends[ended]]
-        return infos | {"end": reasons, "_end": ended}
+        ``of`` chooses sub-environments, all if None. The others have 0 and False.
+        """
+        rows = seen.numbers[:, : self.num_envs]
+        if of is not None:
+            rows = np.where(of, rows, 0.0)
+        marks = np.empty((len(self._info_rows), self.num_envs), dtype=np.bool_)
+        marks[:] = True if of is None else of
+        infos: dict[str, Any] = {}
+        for key, mask, row, mark in zip(
+            self._info_keys, self._mask_keys, self._info_rows, marks, strict=True
+        ):
+            infos[key], infos[mask] = rows[row], mark
+        for key, dtype in self._flags.items():
+            infos[key] = infos[key].astype(dtype)
+        return infos
 
     def close_extras(self, **kwargs: Any) -> None:
         """Do nothing: there is no window to close."""

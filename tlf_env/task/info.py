@@ -2,7 +2,13 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Sequence
+from enum import IntEnum
 from typing import NamedTuple
+
+from tlf_env.disturbances.channels import CHANNELS
+from tlf_env.task.reward import REWARD_MEANINGS
 
 
 class Info(NamedTuple):
@@ -29,8 +35,18 @@ class Info(NamedTuple):
     clipped: float
 
 
-RUNNING, LOST, TOUCHED, OTHER_ROBOT, HORIZON = range(5)
-END_REASONS = ("", "lost", "touched", "other_robot", "horizon")
+class EndReason(IntEnum):
+    """Why a robot's episode ended in a step: the values of ``info["end"]`` and ``BatchPlant.ends``."""
+
+    RUNNING = 0
+    LOST = 1
+    TOUCHED = 2
+    OTHER_ROBOT = 3
+    HORIZON = 4
+
+
+# The same as plain numbers, for compiled laws.
+RUNNING, LOST, TOUCHED, OTHER_ROBOT, HORIZON = (int(reason) for reason in EndReason)
 
 INFO_MEANINGS = {
     "position_error_mm": "true position of c to the robot's own reference (leader: the path)",
@@ -54,13 +70,54 @@ INFO_MEANINGS = {
     "reference_theta_rad": "its heading",
     "clipped": "actions of this robot outside [−1, 1] so far in the episode",
 }
-OTHER_INFO = {
-    "reward": "the unweighted reward terms by name",
-    "disturbance": "the value of every channel that acted, by its path",
+FLAG_MEANINGS = {
     "lost": "whether the robot was lost at any time so far",
     "touched": "whether it touched another at any time so far",
-    "end": "in the last step: lost, touched, other_robot or horizon",
+    "end": "why the episode ended in this step, a `tlf_env.EndReason`: 0 running, 1 lost, 2 touched, "
+    "3 another robot ended it, 4 horizon",
 }
+# All keys of an info, in order, with their meanings.
+MEANINGS = {
+    **INFO_MEANINGS,
+    **{f"reward_{name}": f"reward term: {text}" for name, text in REWARD_MEANINGS.items()},
+    **{channel.key: f"disturbance: {channel.meaning}" for channel in CHANNELS},
+    **FLAG_MEANINGS,
+}
+INFO_KEYS = tuple(MEANINGS)
+
+InfoChoice = bool | Sequence[str]
+
+
+def chosen_keys(infos: InfoChoice) -> tuple[str, ...]:
+    """Keys of the infos that an environment returns: all if True, none if False, or those listed.
+
+    Raises
+    ------
+    ValueError
+        for an unknown key, or anything else.
+    """
+    if isinstance(infos, bool):
+        return INFO_KEYS if infos else ()
+    if isinstance(infos, str) or not isinstance(infos, Sequence):
+        raise ValueError(f"infos {infos!r:.60} must be True, False or a sequence of keys of info")
+    for key in infos:
+        check_key(key)
+    return tuple(dict.fromkeys(infos))
+
+
+def check_key(key: str) -> None:
+    """Check that info has a key.
+
+    Raises
+    ------
+    ValueError
+        naming the key and the nearest one that exists.
+    """
+    if key in INFO_KEYS:
+        return
+    near = difflib.get_close_matches(str(key), INFO_KEYS, n=1)
+    hint = f"; did you mean {near[0]!r}?" if near else f"; the keys are {', '.join(INFO_KEYS)}"
+    raise ValueError(f"info has no key {key!r:.60}{hint}")
 
 
 class State(NamedTuple):
