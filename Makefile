@@ -10,7 +10,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow test-learning check check-lowest format board speed speed-docs constraints clean
+.PHONY: help run test test-slow test-learning check check-lowest check-clients format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -50,6 +50,19 @@ check-lowest: ## Run the tests with the lowest versions that pyproject.toml allo
 		-e ".[figures,view,train,tune,bench,peers,ray,dev]"; \
 	"$$uv" pip check; \
 	"$$VIRTUAL_ENV/bin/python" -m pytest $(TESTS)
+
+# Their requirements exclude each other. CLIENT names the library whose absence is an error, not a skipped test.
+check-clients: ## Run the tests with other libraries, each of CLIENTS in a temporary environment
+	@set -e; \
+	for client in $(CLIENTS); do \
+		echo "== $$client"; \
+		tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \
+		$(PYTHON) -m venv "$$tmp"; \
+		"$$tmp/bin/python" -m pip install -q --disable-pip-version-check -e . \
+			"torch==$(TORCH)" pytest -r "tests/clients/$$client.txt"; \
+		CLIENT=$$client "$$tmp/bin/python" -m pytest -rs tests/test_clients.py; \
+		rm -rf "$$tmp"; \
+	done
 
 format: $(VENV)/.stamp-test ## Sort the imports and format the sources
 	$(BIN)/ruff check --select I --fix
