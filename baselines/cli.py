@@ -18,10 +18,12 @@ from typer.exceptions import TyperException
 from baselines.console import (
     listed,
     notes,
+    print_on_any_terminal,
     progress_bar,
     screen,
     warn_of_compiling,
     warn_of_missing,
+    warn_of_scenarios,
     whole_numbers,
     writable_folder,
 )
@@ -103,7 +105,7 @@ def run(
     from baselines.runs.run import run_policy
     from baselines.tables import metrics_table
     from tlf_env.numerics.philox import checked_seed
-    from tlf_env.task.scenario import load_scenario, scenario_notes, scenario_warnings
+    from tlf_env.task.scenario import load_scenario, scenario_notes
 
     chosen = load_scenario(
         scenario,
@@ -122,11 +124,10 @@ def run(
     driver, chosen, overrides = fit_policy(name, chosen, trust=trust)
     if overrides:
         fields = ", ".join(describe_overrides(overrides))
-        notes.print(f"tlf: note: {name} asks for {fields}", markup=False, soft_wrap=True)
-    for line in scenario_warnings(chosen):
-        notes.print(f"tlf: warning: {line}", markup=False, soft_wrap=True)
+        notes.print(f"tlf: note: {name} asks for {fields}", soft_wrap=True)
+    warn_of_scenarios([(chosen.name, chosen)])
     for line in scenario_notes(chosen):
-        notes.print(f"tlf: note: {line}", markup=False, soft_wrap=True)
+        notes.print(f"tlf: note: {line}", soft_wrap=True)
     folder = writable_folder(out or Path("results") / chosen.name)
     warn_of_compiling()
     with progress_bar(f"{chosen.name}, {name}") as update:
@@ -311,7 +312,7 @@ def bench(
     ] = False,
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
-    from baselines.benchmark.bench import run_bench
+    from baselines.benchmark.bench import named_scenarios, run_bench
     from baselines.benchmark.plan import Plan, disturbance_presets, parse_seeds, parse_sweep
     from baselines.runs.provenance import command_line
     from baselines.tables import board_table
@@ -334,6 +335,7 @@ def bench(
         ),
         trust=trust,
     )
+    warn_of_scenarios(named_scenarios(asked))
     with progress_bar("bench") as update:
         results = run_bench(
             asked,
@@ -390,6 +392,7 @@ def train(
     numbers = whole_numbers("seeds", seeds)
     name = Path(config).stem
     folder = writable_folder(out or Path("results/train") / name)
+    warn_of_scenarios(loaded.named_scenarios())
     warn_of_compiling()
     with progress_bar(f"train {name}") as update:
         curves = train_seeds(
@@ -448,6 +451,7 @@ def tune(
 
     search = load_tune(config, trials=trials)
     folder = out or Path("results") / "tune" / Path(config).stem
+    warn_of_scenarios(search.scenarios(search.ekf_slip).items())
     warn_of_compiling()
     with progress_bar("tune") as update:
         result = run_tune(
@@ -478,6 +482,7 @@ def draw_bench(board: dict[str, Any], folder: Path) -> list[Path]:
 
 def main() -> None:
     """Run the command line; invalid input ends in one line on stderr and exit status 2."""
+    print_on_any_terminal()
     try:
         status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
     except TyperException as error:
@@ -495,5 +500,5 @@ def main() -> None:
 
 def fail(message: str, status: int) -> None:
     """Print a message in one line, and exit."""
-    notes.print(f"tlf: {' '.join(message.split())}", markup=False, soft_wrap=True)
+    notes.print(f"tlf: {' '.join(message.split())}", soft_wrap=True)
     sys.exit(status)

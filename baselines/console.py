@@ -2,22 +2,62 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import codecs
+import io
+import sys
+import unicodedata
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-screen = Console(highlight=False)
-notes = Console(stderr=True, highlight=False)
+if TYPE_CHECKING:
+    from tlf_env.task.scenario import Scenario
+
+# Texts are printed as they are: a bracket is no markup, and a colon begins no emoji.
+screen = Console(highlight=False, markup=False, emoji=False)
+notes = Console(stderr=True, highlight=False, markup=False, emoji=False)
+
+# What is printed where an encoding lacks a character: mostly one character, so that columns stay in line.
+PLAIN = {
+    "–": "-", "—": "-", "−": "-", "‑": "-", "·": ".", "×": "x", "…": "...", "→": "->", "≤": "<=",
+    "≥": ">=", "±": "+-", "∞": "inf", "θ": "theta", "δ": "delta", "ψ": "psi", "ω": "omega",
+    "“": '"', "”": '"', "‘": "'", "’": "'", "•": "*", "━": "-", "─": "-", "╸": "-", "╺": "-",
+    "ß": "ss", "°": "deg", "µ": "u", "μ": "u",
+}  # fmt: skip
+
+
+def _plain(error: UnicodeError) -> tuple[str, int]:
+    """Plain characters for those that cannot be encoded: of :data:`PLAIN`, without accents, or ``?``."""
+    if not isinstance(error, UnicodeEncodeError):
+        raise error
+    replaced = [
+        PLAIN.get(one)
+        or unicodedata.normalize("NFKD", one).encode("ascii", "ignore").decode()
+        or "?"
+        for one in error.object[error.start : error.end]
+    ]
+    return "".join(replaced), error.end
+
+
+codecs.register_error("tlf.plain", _plain)
+
+
+def print_on_any_terminal() -> None:
+    """Let standard output and error replace what their encoding lacks, instead of failing."""
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="tlf.plain")
 
 
 @contextmanager
 def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
     """A progress bar on stderr; yields ``update(done, total)``."""
     columns = (
-        TextColumn("{task.description}"),
+        TextColumn("{task.description}", markup=False),
         BarColumn(),
         MofNCompleteColumn(),
         TimeRemainingColumn(),
@@ -27,11 +67,20 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: bar.update(task, completed=done, total=total)
 
 
+def warn_of_scenarios(scenarios: Iterable[tuple[str, Scenario]]) -> None:
+    """Print the warnings for some scenarios, each with its name; every line once."""
+    from tlf_env.task.warn import warning_lines
+
+    for line in warning_lines(scenarios):
+        notes.print(f"tlf: warning: {line}", soft_wrap=True)
+
+
 def warn_of_compiling() -> None:
     """Announce the compilation before the first run on a machine."""
     from tlf_env.numerics.compiled import cache_folder
 
-    if not any(cache_folder().rglob("*control_step*.nbi")):
+    folder = cache_folder()
+    if folder is None or not any(folder.rglob("*control_step*.nbi")):
         notes.print("Compiling the step drivers, once on this machine: about a minute.")
 
 

@@ -10,8 +10,10 @@ import gymnasium
 import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
+from tlf_env.common.errors import shown
 from tlf_env.engine.batch import BatchPlant, Source, checked_count
 from tlf_env.numerics.philox import checked_seed
+from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.info import InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
@@ -93,7 +95,7 @@ class FormationVecEnv(VecEnv):
         dtype = np.dtype(self.plants[0].scenario.dtype)
         entries = self.plants[0].observations.shape[2]
         self._attributes: list[dict[str, Any]] = [{} for _ in range(self._ends[-1])]
-        self._actions: np.ndarray | None = None
+        self._actions: tuple[Any] | None = None
         super().__init__(
             int(self._ends[-1]),
             gymnasium.spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT, (entries,), dtype.type),
@@ -154,7 +156,7 @@ class FormationVecEnv(VecEnv):
             options = [options or {}] * self.num_envs
         if isinstance(options, str) or not isinstance(options, Sequence):
             raise ValueError(
-                f"options must be a mapping or a sequence of them, got {options!r:.60}"
+                f"options must be a mapping or a sequence of them, got {shown(options)}"
             )
         if len(options) != self.num_envs:
             raise ValueError(f"options: {len(options)} mappings for {self.num_envs} robots")
@@ -202,7 +204,7 @@ class FormationVecEnv(VecEnv):
 
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions, ``(num_envs, 2)``, for the step."""
-        self._actions = np.asarray(actions)
+        self._actions = (actions,)
 
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """Advance all formations by one control period: observations, rewards, dones, infos.
@@ -212,20 +214,20 @@ class FormationVecEnv(VecEnv):
         ValueError
             for actions of another shape or not finite; then no state changes.
         """
-        actions = self._actions
-        if actions is None:
+        if self._actions is None:
             raise RuntimeError("call step_async() before step_wait()")
-        self._actions = None
-        if (
-            actions.shape != (self.num_envs, ACTION_SIZE)
-            or actions.dtype.kind not in "biuf"
-            or not np.isfinite(actions).all()
-        ):
+        (actions,), self._actions = self._actions, None
+        given = real_numbers(actions)
+        if given is None:
+            raise ValueError(
+                f"actions must be {(self.num_envs, ACTION_SIZE)} finite numbers, got {shown(actions)}"
+            )
+        if given.shape != (self.num_envs, ACTION_SIZE) or not np.isfinite(given).all():
             raise ValueError(
                 f"actions must be {(self.num_envs, ACTION_SIZE)} finite numbers, got the shape "
-                f"{actions.shape} of {actions.dtype}"
+                f"{given.shape}: {shown(actions)}"
             )
-        for plant, rows in self._parts(actions):
+        for plant, rows in self._parts(given):
             plant.step(rows.reshape(plant.arrays.actions.shape))
         rewards = np.concatenate([plant.rewards.ravel() for plant in self.plants])
         infos = self._infos()

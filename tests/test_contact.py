@@ -1,8 +1,12 @@
 from __future__ import annotations
 
+import copy
 import math
-from typing import NamedTuple
+import pickle
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import cloudpickle
 import numpy as np
 import pymunk
 import pytest
@@ -264,3 +268,80 @@ def test_injected_slip_at_level_zero_is_the_nominal_run_bit_for_bit():
     nominal, zero, disturbed = (env.formation.arrays.rows("motion") for env in envs)
     assert np.array_equal(nominal, zero)
     assert not np.array_equal(nominal, disturbed)
+
+
+# --- copies ------------------------------------------------------------------------------------------
+
+COPIERS: dict[str, Callable[[Any], Any]] = {
+    "deepcopy": copy.deepcopy,
+    "pickle": lambda env: pickle.loads(pickle.dumps(env)),
+    "cloudpickle": lambda env: cloudpickle.loads(cloudpickle.dumps(env)),
+}
+PUSHED_S, STEP_S = 10.0, 0.02
+PUSHED_STEPS = round(PUSHED_S / STEP_S)
+MOMENTS = (
+    0,
+    *range(4, 40, 3),
+    *range(70, 480, 31),
+    150,
+    151,
+)  # control steps; first contacts are early
+TO_THE_END = (0, 16, 22)
+FOR_STEPS = 10
+
+
+def pushing(robots: int) -> Any:
+    """A queue of robots, the first of which backs into the others."""
+    env = tlf_env.parallel_env(
+        "infinity", robots=robots, horizon_s=PUSHED_S, control_period_s=STEP_S, time_gap_s=0.1,
+        preview_s=(), end_on=(),
+    )  # fmt: skip
+    env.reset(seed=0, options={"poses": [[0.0, -210.0 * i, 0.0] for i in range(robots)]})
+    return env
+
+
+def push(env: Any, step: int) -> bytes:
+    """One control step, and all that it gives."""
+    rng = np.random.default_rng(step // 25)
+    forward, turning = rng.uniform(-0.2, 0.8, 5), rng.uniform(-0.5, 0.5, 5)
+    forward[0] = -0.3
+    agents = env.possible_agents
+    observations, rewards, *_ = env.step(
+        {agent: [forward[i], turning[i]] for i, agent in enumerate(agents)}
+    )
+    seen = [*observations.values(), np.array(list(rewards.values())), env.unwrapped.state()]
+    return b"".join(array.tobytes() for array in seen)
+
+
+@pytest.mark.parametrize("robots", [2, 3, 4, 5])
+def test_copies_before_at_and_in_contact_go_on_bit_for_bit(robots):
+    env, copies, course = pushing(robots), [], []
+    for step in range(PUSHED_STEPS):
+        if step in MOMENTS:
+            name = list(COPIERS)[len(copies) % len(COPIERS)]
+            copies.append((step, name, COPIERS[name](env)))
+        course.append(push(env, step))
+    for first, name, twin in copies:
+        last = PUSHED_STEPS if first in TO_THE_END else first + FOR_STEPS
+        for step in range(first, last):
+            assert push(twin, step) == course[step], (first, name, step)
+    again = pushing(robots)  # nothing was copied from this one
+    assert [push(again, step) for step in range(PUSHED_STEPS)] == course
+
+
+@pytest.mark.parametrize("copier", COPIERS.values(), ids=COPIERS)
+def test_a_copy_of_a_copy_and_a_second_copy_go_on_alike(copier):
+    env = pushing(3)
+    for step in range(40):
+        push(env, step)
+    twins = [copier(env), copier(copier(env)), copier(env)]
+    for step in range(40, 120):
+        wanted = push(env, step)
+        assert all(push(twin, step) == wanted for twin in twins)
+
+
+def test_a_look_at_the_space_changes_nothing_in_a_pile():
+    quiet, looked_at = pushing(4), pushing(4)
+    for step in range(300):
+        assert len(looked_at.space.bodies) == 4
+        assert push(quiet, step) == push(looked_at, step)

@@ -3,6 +3,7 @@
 import json
 import math
 import re
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -10,6 +11,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from baselines.policies.reference import ReferencePolicy
+from baselines.runs.run import run_policy
 from tlf_env.task.metrics import (
     RobotMetrics,
     StringMetrics,
@@ -344,3 +347,17 @@ def test_deviation_from_a_reference_that_stands_is_zero():
 def test_the_documentation_defines_every_metric_in_order():
     defined = re.findall(r"^\| `(\w+)` \|", DOCS.read_text(encoding="utf-8"), re.MULTILINE)
     assert defined == [*RobotMetrics._fields, *StringMetrics._fields]
+
+
+@pytest.mark.parametrize("horizon_s", [0.02, 0.04, 0.1, 1.0, 4.0, 5.0, 6.0, 10.0, 12.0])
+@pytest.mark.parametrize("robots", [1, 3])
+def test_metrics_of_a_short_run_give_no_warning(horizon_s, robots):
+    """Robots that have not moved yet have a spectrum of zeros, and a coherence that is not defined."""
+    scenario = load_scenario("infinity", horizon_s=horizon_s, robots=robots)
+    policy = ReferencePolicy(preview_s=scenario.preview_s)
+    record = run_policy(scenario, policy, 0)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert len(record.metrics()) == robots
+        string = record.string()
+    assert all(value is None or np.isfinite(value) for value in string)

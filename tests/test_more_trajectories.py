@@ -77,7 +77,7 @@ def message(build, *args, **kwargs) -> str:
     with pytest.raises(ValueError, match=r"\S") as caught:
         build(*args, **kwargs)
     error = caught.value
-    text = one_line(error) if isinstance(error, ValidationError) else str(error)
+    text = one_line(error, Trajectory) if isinstance(error, ValidationError) else str(error)
     assert "\n" not in text
     return text
 
@@ -391,7 +391,11 @@ class TestWaypoints:
             ({"points": [(0, 0, 0), 5]}, "points[1]: must be 3 numbers"),
             ({"points": [(0, 0, 0), (1, None, 5)]}, "points[1]: x_mm must be a number"),
             ({"points": [(0, 0, 0), (1, True, 5)]}, "points[1]: x_mm must be a number"),
-            ({"points": [(0, 0, 0), (1, 1e10, 5)]}, "within ±1e+09, got 10000000000.0"),
+            ({"points": [(0, 0, 0), (1, 2e10, 5)]}, "within ±1e+10, got 20000000000.0"),
+            (
+                {"points": [(0, 0, 0), (2e9, 5, 5)]},
+                "points[1]: t_s 2000000000 must be at most 1e+09",
+            ),
             ({"points": [(0, 0, 0), (0, 1, 5)]}, "points[1]: t_s 0 must be above 0"),
             ({"file": 5}, "file must be a path, got 5"),
             ({"points": [(0, 0, 0), (1, 1, 1)], "speed": 3}, "unknown key"),

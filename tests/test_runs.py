@@ -5,9 +5,10 @@ import sys
 
 import pytest
 
+from baselines import ReferencePolicy
 from baselines.runs.outcome import failed
 from baselines.runs.provenance import command_line, installed_versions, versions
-from baselines.runs.run import SEEDS_PER_BLOCK, run_policy, seed_blocks
+from baselines.runs.run import SEEDS_PER_BLOCK, run_policy, run_seeds, seed_blocks
 from baselines.runs.seed_ranges import (
     CHOOSING_SEEDS,
     FIRST_TABLE_SEED,
@@ -80,3 +81,19 @@ def test_the_package_is_the_command_line(words):
     )
     assert bad.returncode == 2
     assert bad.stderr.startswith("tlf: scenario 'no_such'")
+
+
+@pytest.mark.parametrize("count", [1, 2, 63, 64, 65, 72, 100, 127, 128, 129, 200])
+def test_any_number_of_seeds_runs_side_by_side(count):
+    """From 64 on, the engine's rows have unused places behind the last run."""
+    scenario = load_scenario(
+        "infinity", plant="batch", disturbance="slip", horizon_s=0.2, time_gap_s=0.1, preview_s=()
+    )
+    seeds = range(5, 5 + count)
+    records = list(run_seeds(scenario, ReferencePolicy(), seeds))
+    assert [record.seed for record in records] == list(seeds)
+    for record in (records[0], records[count // 2], records[-1]):
+        alone = run_policy(scenario, ReferencePolicy(), record.seed)
+        assert record.metrics() == alone.metrics()
+        for name, column in alone.columns.items():
+            assert (record[name] == column).all(), name

@@ -40,7 +40,7 @@ def redrawn(fields, count):
 def refusal(**fields):
     with pytest.raises(ValidationError) as caught:
         signal(**fields)
-    line = one_line(caught.value)
+    line = one_line(caught.value, Signal)
     assert "\n" not in line
     return line
 

@@ -283,7 +283,7 @@ def test_each_sub_environment_may_start_in_its_own_way():
 @pytest.mark.parametrize("mode", MODES)
 def test_a_reset_after_the_end_takes_its_options(mode):
     """Also where the next episode of an ended formation has started already."""
-    short = {"horizon_s": 0.4, "time_gap_s": 0.2, "preview_s": ()}
+    short = {"horizon_s": 0.4, "time_gap_s": 0.4, "preview_s": (), "end_on": ()}
     env, alone = vector(2, mode, **short), [single(1, mode, **short) for _ in range(2)]
     env.reset(seed=9)
     for k, one in enumerate(alone):

@@ -20,6 +20,7 @@ from baselines.runs.jobs import spread
 from baselines.runs.provenance import physics_digest
 from baselines.runs.run import Record, run_policy, run_seeds, seed_blocks
 from tlf_env.task.neutral import scenario_hash
+from tlf_env.task.scenario import Scenario, load_scenario
 
 IN_FLIGHT_PER_PROCESS = 4
 
@@ -59,6 +60,31 @@ def _line(episode: Episode, fitted: FittedPolicy, record: Record) -> dict[str, A
         "string": record.string()._asdict(),
         "robots": [metrics._asdict() for metrics in record.metrics()],
     }
+
+
+def named_scenarios(plan: Plan) -> list[tuple[str, Scenario]]:
+    """Every scenario of a plan with its task and disturbance, as the policies ask for it.
+
+    Raises
+    ------
+    ValueError
+        as :meth:`Plan.scenario` and :func:`~baselines.policies.registry.fit_policy`.
+    """
+    named = []
+    for task in plan.tasks:
+        asked: dict[str, dict[str, Any]] = {}
+        for disturbance in plan.disturbances:
+            for value in plan.values:
+                episode = Episode("", task, disturbance, plan.level, value, plan.seeds[0])
+                scenario = plan.scenario(episode)
+                for policy in plan.policies:
+                    if policy not in asked:
+                        fitted = fit_policy(policy, scenario, trust=plan.trust)
+                        asked[policy] = fitted.overrides
+                    named.append(
+                        (f"{task}, {disturbance}", load_scenario(scenario, **asked[policy]))
+                    )
+    return named
 
 
 def blocks(plan: Plan, episodes: Sequence[Episode]) -> list[tuple[Episode, ...]]:

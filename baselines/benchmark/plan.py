@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import SeedRange
+from tlf_env.common.errors import nearest
 from tlf_env.common.presets import preset_names, read_preset_or_file
 from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -148,9 +149,12 @@ def read_plan(name: str, fields: Collection[str]) -> dict[str, Any]:
     options = {}
     for field, value in found.items():
         if field not in fields:
-            raise ValueError(f"plan {name!r} has {field!r}; a plan has {', '.join(sorted(fields))}")
+            raise ValueError(
+                f"plan {name!r} has {field!r}; a plan has {', '.join(sorted(fields))}"
+                f"{nearest(field, fields)}"
+            )
         options[field] = ",".join(map(str, value)) if isinstance(value, list) else value
-        if not isinstance(options[field], str | int | float):
+        if isinstance(value, bool) or not isinstance(options[field], str | int | float):
             raise ValueError(f"plan {name!r}: {field} must be a text, a number or a list")
     return options
 

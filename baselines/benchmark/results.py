@@ -17,7 +17,7 @@ from baselines.runs.provenance import (
     simulation_digest,
     versions,
 )
-from tlf_env.common.files import atomic
+from tlf_env.common.files import atomic, parse_json
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.task.neutral import scenario_hash
 
@@ -96,7 +96,7 @@ class Results:
         lines: dict[Episode, dict[str, Any]] = {}
         for number, text in enumerate(whole.splitlines(), start=1):
             try:
-                line = json.loads(text)
+                line = parse_json(text)
                 lines[Episode.of_line(line)] = line
             except (ValueError, KeyError, TypeError) as error:
                 raise ValueError(f"{path}, line {number} is damaged; remove it") from error

@@ -20,8 +20,8 @@ from safetensors.numpy import load, save
 from baselines.policies.columns import Columns, find_scaled_columns
 from baselines.policies.network import NORMALISATION, Network
 from tlf_env.common.errors import one_line
-from tlf_env.common.files import atomic
-from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.files import atomic, parse_json
+from tlf_env.common.models import Frozen, NonNegative, Positive, Whole
 from tlf_env.task.actions import ACTION_ENTRIES, ActionKind
 from tlf_env.task.observation import SAMPLE_ENTRIES, sensor_entries, tracking_entries
 from tlf_env.task.scenario import Scenario
@@ -56,7 +56,7 @@ class Card(Frozen):
     # How it was made: a record that no code reads.
     scenario: dict[str, JsonValue]  # the whole scenario of the training
     training: dict[str, JsonValue]  # settings of the algorithm, environment steps, wall time
-    seeds: dict[str, tuple[int, ...]]  # seeds of everything that was seeded
+    seeds: dict[str, tuple[Whole, ...]]  # seeds of everything that was seeded
     versions: dict[str, str]
     scores: dict[str, JsonValue]
     command: str  # that made it
@@ -189,7 +189,7 @@ def write_policy(
         if the name does not end in ``.safetensors``, a tensor is missing, unknown, of a wrong shape
         or not finite, or a value is not allowed in a card.
     """
-    if path.suffix != WEIGHTS:
+    if path.suffix.lower() != WEIGHTS:
         raise ValueError(f"{path}: the name of a policy must end in {WEIGHTS}")
     # safetensors writes the memory of an array and ignores its strides.
     kept = {
@@ -211,14 +211,21 @@ def write_policy(
             weights_sha256=hashlib.sha256(data).hexdigest(),
         )
     except ValidationError as error:
-        raise ValueError(f"{path.with_suffix(CARD)}: {one_line(error)}") from error
+        raise ValueError(f"{card_path(path)}: {one_line(error, Card)}") from error
     check_tensors(path, card, kept)
     text = json.dumps(card.model_dump(mode="json"), indent=2, ensure_ascii=False, allow_nan=False)
     with atomic(path, "wb") as file:
         file.write(data)
-    with atomic(path.with_suffix(CARD), encoding="utf-8") as file:
+    with atomic(card_path(path), encoding="utf-8") as file:
         file.write(text + "\n")
     return card
+
+
+def card_path(path: Path) -> Path:
+    """The card of a policy's weights: ``NAME.json``, or ``NAME.JSON`` if that is the file there is."""
+    card = path.with_suffix(CARD)
+    shouted = path.with_suffix(CARD.upper())
+    return shouted if shouted.exists() and not card.exists() else card
 
 
 def read_policy(path: Path) -> Loaded:
@@ -232,7 +239,7 @@ def read_policy(path: Path) -> Loaded:
         finite.
     """
     data = _bytes_of(path, "")
-    place = path.with_suffix(CARD)
+    place = card_path(path)
     card = _card(place, _bytes_of(place, f"{path} needs its card: "))
     try:
         tensors = load(data)
@@ -297,13 +304,13 @@ def _bytes_of(path: Path, why: str) -> bytes:
 
 def _card(path: Path, data: bytes) -> Card:
     try:
-        json.loads(data)
-    except ValueError as error:  # here, as pydantic's message would contain the whole file
+        parse_json(data)  # here, as pydantic's message would contain the whole file
+    except ValueError as error:
         raise ValueError(f"{path} is not JSON: {_line(error)}") from error
     try:
         return Card.model_validate_json(data, strict=True)
     except ValidationError as error:
-        raise ValueError(f"{path}: {one_line(error)}") from error
+        raise ValueError(f"{path}: {one_line(error, Card)}") from error
 
 
 def _line(error: Exception) -> str:

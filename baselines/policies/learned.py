@@ -52,7 +52,7 @@ def load_policy(path_or_name: str | Path, *, seed: int = 0) -> LearnedPolicy:
         in one line, for an unknown name, and as :func:`baselines.policies.card.read_policy` does.
     """
     text = str(path_or_name)
-    if text.endswith(WEIGHTS):
+    if text.lower().endswith(WEIGHTS):
         return LearnedPolicy(read_policy(Path(text)), seed=seed)
     if text in shipped_policies():
         return LearnedPolicy(read_policy(SHIPPED / f"{text}{WEIGHTS}"), seed=seed)

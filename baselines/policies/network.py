@@ -6,13 +6,13 @@ from typing import Annotated, Literal
 
 from pydantic import Field
 
-from tlf_env.common.models import Frozen
+from tlf_env.common.models import Frozen, Switch, Whole
 from tlf_env.task.actions import ACTION_SIZE
 
 NORMALISATION = "normalise."
 LSTM_GATES = 4  # input, forget, cell, output, in this order
 
-Size = Annotated[int, Field(ge=1)]
+Size = Annotated[Whole, Field(ge=1)]
 
 
 class Network(Frozen):
@@ -25,7 +25,7 @@ class Network(Frozen):
     activation: Literal["tanh", "relu"]  # after each of them
     lstm: Size | None = None  # size of its state; None without an LSTM
     head: Literal["gaussian", "squashed_gaussian"]  # squashed: tanh of the draw, as SAC does
-    normalised: bool = False  # whether observations are normalised as VecNormalize does
+    normalised: Switch = False  # whether observations are normalised as VecNormalize does
 
     def shapes(self, entries: int) -> dict[str, tuple[int, ...]]:
         """Shapes of all tensors by name, for an observation of so many entries.

@@ -147,9 +147,9 @@ def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
 
 
 def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
-    if name.endswith(".zip"):
+    if name.lower().endswith(".zip"):
         return _stable_baselines(Path(name), scenario, trust=trust)
-    if name.endswith(WEIGHTS) or name in shipped_policies():
+    if name.lower().endswith(WEIGHTS) or name in shipped_policies():
         return load_policy(name)
     head, _, tail = name.partition(":")
     if head == "reference" and name != "reference:":
@@ -186,7 +186,7 @@ def policy_hash(name: str, policy: Policy) -> str | None:
 
     Comments, docstrings and layout of Python files do not count.
     """
-    files = [Path(name)] if name.endswith(".zip") else _source_files(policy)
+    files = [Path(name)] if name.lower().endswith(".zip") else _source_files(policy)
     if not files:
         return None
     return hashlib.sha256(b"".join(map(_hashed_content, files))).hexdigest()[:12]

@@ -15,7 +15,7 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, TypeVar
 
-from tlf_env.common.files import atomic
+from tlf_env.common.files import atomic, read_json
 
 POLLED_EVERY_S = 0.5
 
@@ -47,7 +47,7 @@ def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) ->
             file.write("\n")
         return
     try:
-        before = dict(json.loads(path.read_text(encoding="utf-8")))
+        before = dict(read_json(path))
     except (ValueError, TypeError) as error:
         raise ValueError(f"{path} is damaged; choose another --out, or remove it") from error
     for key in keys:

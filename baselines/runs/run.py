@@ -18,6 +18,7 @@ from tlf_env.task.info import Info
 from tlf_env.task.metrics import RobotMetrics, StringMetrics, robot_metrics, string_metrics
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.start import start_options
+from tlf_env.task.warn import without_warnings
 
 ItemT = TypeVar("ItemT")
 
@@ -153,7 +154,8 @@ def run_seeds(
     The policy is called once per step with all rows, ``(seed · robots, entry)``. If it refuses them with
     a ValueError, the seeds are run one after the other.
     """
-    plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds))
+    with without_warnings():
+        plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds))
     plant.reset(list(seeds))
     a, steps = plant.arrays, scenario.horizon_steps
     tape = _Tape(a, steps)

@@ -2,21 +2,22 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
-from pydantic import Field, FiniteFloat, ValidationError, model_validator
+from pydantic import Field, ValidationError, model_validator
 
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from tlf_env.common.errors import one_line
-from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Whole
 from tlf_env.common.presets import read_preset_or_file
-from tlf_env.task.scenario import Scenario, load_scenario
+from tlf_env.task.scenario import Scenario, scenario_with
 
-Count = Annotated[int, Field(ge=1)]
+Count = Annotated[Whole, Field(ge=1)]
 SeedsFromTo = tuple[
-    Annotated[int, Field(ge=0)], Annotated[int, Field(ge=0)]
+    Annotated[Whole, Field(ge=0)], Annotated[Whole, Field(ge=0)]
 ]  # first, end (not run)
 
 
@@ -26,7 +27,7 @@ class NetworkConfig(Frozen):
     hidden: Annotated[tuple[Count, ...], Field(max_length=4)] = (64, 64)
     activation: Literal["tanh", "relu"] = "tanh"
     lstm: Count | None = None  # size of the LSTM's state; RecurrentPPO only
-    initial_log_std: FiniteFloat = -1.6
+    initial_log_std: Number = -1.6
     action_gain: Positive = 0.1  # factor on the initial weights of the action: begin near 0
 
 
@@ -60,7 +61,7 @@ class TrainConfig(Frozen):
 
     algorithm: Literal["PPO", "SAC", "RecurrentPPO"]
     settings: dict[str, Any] = {}  # keyword arguments of SB3's algorithm
-    final_learning_rate_share: Annotated[FiniteFloat, Field(gt=0, le=1)] = 1.0  # falls linearly
+    final_learning_rate_share: Annotated[Number, Field(gt=0, le=1)] = 1.0  # falls linearly
     network: NetworkConfig = NetworkConfig()
     imitation: ImitationConfig | None = None
     robot_steps: Count  # control steps × robots, over all formations
@@ -92,6 +93,12 @@ class TrainConfig(Frozen):
         for reserved in ("seed", "policy", "env", "policy_kwargs", "tensorboard_log", "use_sde"):
             if reserved in self.settings:
                 raise ValueError(f"settings.{reserved} is set by the training and must be left out")
+        for place, fields in (
+            ("scenario", self.scenario),
+            *((f"tasks.{task}", fields) for task, fields in self.tasks.items()),
+        ):
+            if "disturbance" in fields:
+                raise ValueError(f"{place}.disturbance must be left out; disturbances has them all")
         self.mixture()
         self.evaluation_scenarios()
         return self
@@ -107,27 +114,40 @@ class TrainConfig(Frozen):
         wanted = {name: share for name, share in self.disturbances.items() if share > 0}
         shares = [share for share in wanted.values() for _ in self.levels]
         tasks = {
-            task: [
-                self._scenario(task, disturbance=name, disturbance_level=level, **fields)
-                for name in wanted
-                for level in self.levels
-            ]
-            for task, fields in self.tasks.items()
+            task: [self._scenario(task, name, level) for name in wanted for level in self.levels]
+            for task in self.tasks
         }
         return tasks, shares
 
     def evaluation_scenarios(self) -> dict[tuple[str, str], Scenario]:
         """Scenario of each task and disturbance of the evaluation."""
         return {
-            (task, name): self._scenario(
-                task, **{**fields, "horizon_s": self.evaluation.horizon_s, "disturbance": name}
-            )
-            for task, fields in self.tasks.items()
+            (task, name): self._scenario(task, name, None, horizon_s=self.evaluation.horizon_s)
+            for task in self.tasks
             for name in self.evaluation.disturbances
         }
 
-    def _scenario(self, task: str, **fields: Any) -> Scenario:
-        return load_scenario(task, **{**self.scenario, "plant": "batch", **fields})
+    def named_scenarios(self) -> list[tuple[str, Scenario]]:
+        """Every scenario of the training and of its evaluation, with its task and disturbance."""
+        tasks, _ = self.mixture()
+        trained = [
+            (f"{task}, {one.disturbance.name}", one)
+            for task, scenarios in tasks.items()
+            for one in scenarios
+        ]
+        evaluated = self.evaluation_scenarios().items()
+        return trained + [(", ".join(place), scenario) for place, scenario in evaluated]
+
+    def _scenario(self, task: str, disturbance: str, level: float | None, **more: Any) -> Scenario:
+        """A task's scenario; an error names the place of the key in the configuration."""
+        own = self.tasks[task]
+        fields = {**self.scenario, "plant": "batch", **own, **more, "disturbance": disturbance}
+        try:
+            return scenario_with(task, fields, level)
+        except ValueError as error:
+            key = re.split(r"[.:\s]", str(error), maxsplit=1)[0]
+            place = f"tasks.{task}." if key in own else "scenario." if key in self.scenario else ""
+            raise ValueError(f"{place}{error}") from error
 
 
 def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> TrainConfig:
@@ -146,4 +166,4 @@ def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> Tra
     try:
         return TrainConfig.model_validate(data)
     except ValidationError as error:
-        raise ValueError(one_line(error)) from error
+        raise ValueError(one_line(error, TrainConfig)) from error

@@ -67,7 +67,7 @@ def export_policy(
         for an unsupported model, or one that does not fit the scenario.
     """
     path = Path(path)
-    if path.suffix != WEIGHTS:
+    if path.suffix.lower() != WEIGHTS:
         raise ValueError(f"{path}: the name of a policy must end in {WEIGHTS}")
     algorithm = type(model).__name__
     if algorithm not in ALGORITHMS:

@@ -12,12 +12,13 @@ from stable_baselines3 import PPO, SAC
 
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import TrainConfig
+from tlf_env.task.warn import without_warnings
 
 OFF_POLICY_STEPS = 64
 
 
 def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
-    """All formations; every episode draws its disturbance from the config's.
+    """All formations; every episode draws its disturbance from the config's. Gives no warning.
 
     Raises
     ------
@@ -25,7 +26,10 @@ def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
         if there are fewer seeds than formations.
     """
     tasks, shares = config.mixture()
-    envs = FormationVecEnv(tasks, config.formations, mixture=shares, threads=threads, infos=False)
+    with without_warnings():
+        envs = FormationVecEnv(
+            tasks, config.formations, mixture=shares, threads=threads, infos=False
+        )
     first, end = config.seeds
     if end - first < config.formations:
         raise ValueError(

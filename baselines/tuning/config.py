@@ -9,7 +9,6 @@ from typing import Any, Self
 from pydantic import (
     BaseModel,
     Field,
-    FiniteFloat,
     ValidationError,
     field_validator,
     model_validator,
@@ -18,7 +17,7 @@ from pydantic import (
 from baselines.runs.nested import value_at, with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from tlf_env.common.errors import one_line
-from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch, Whole
 from tlf_env.common.presets import read_preset_or_file
 from tlf_env.onboard.controllers import ControllerFile, controller
 from tlf_env.onboard.kinds import EstimatorKind
@@ -41,9 +40,9 @@ CAPS = {
 class Range(Frozen):
     """Search range of a number, ends included."""
 
-    low: FiniteFloat
-    high: FiniteFloat
-    log: bool = False  # uniform in the logarithm
+    low: Number
+    high: Number
+    log: Switch = False  # uniform in the logarithm
     times: str | None = None  # the value is a factor on the number at this path
 
     @model_validator(mode="after")
@@ -58,8 +57,8 @@ class Range(Frozen):
 class CountedSeeds(Frozen):
     """Seeds ``first`` to ``first + count - 1``."""
 
-    first: int = Field(ge=0)
-    count: int = Field(ge=1, le=1000)
+    first: Whole = Field(ge=0)
+    count: Whole = Field(ge=1, le=1000)
 
     @property
     def all(self) -> list[int]:
@@ -70,7 +69,7 @@ class CountedSeeds(Frozen):
 class Choice(CountedSeeds):
     """Seeds on which the best trials are compared with the start."""
 
-    finalists: int = Field(default=5, ge=1)  # without the start
+    finalists: Whole = Field(default=5, ge=1)  # without the start
 
 
 class Objective(Frozen):
@@ -106,11 +105,11 @@ class TuneConfig(Frozen):
     seeds: CountedSeeds
     choose: Choice
     horizon_s: Positive
-    trials: int = Field(ge=1, le=100_000)  # in all, including the start
-    startup_trials: int = Field(default=20, ge=1)  # random trials before the sampler proposes
-    sampler_seed: int = Field(default=0, ge=0)
+    trials: Whole = Field(ge=1, le=100_000)  # in all, including the start
+    startup_trials: Whole = Field(default=20, ge=1)  # random trials before the sampler proposes
+    sampler_seed: Whole = Field(default=0, ge=0)
     # A trial stops when so many more of its runs have failed than of the start's; None: never.
-    stop_after_failed: int | None = Field(default=2, ge=1)
+    stop_after_failed: Whole | None = Field(default=2, ge=1)
     objective: Objective = Objective()
 
     @field_validator("start", mode="before")
@@ -208,13 +207,14 @@ class TuneConfig(Frozen):
             times = self.search[path].times
             factor = 1.0 if times is None else value_at(tree, times)
             tree = with_value(tree, path, _rounded(values[path] * factor))
-        slip = tree.pop("ekf_slip") if self.estimator == "ekf-slip" else None
+        own = tree.pop("ekf_slip")
+        slip = own if self.estimator == "ekf-slip" else None
         try:
             return ControllerFile.model_validate(
                 {"controller": tree, "estimator": self.estimator, "ekf_slip": slip}
             )
         except ValidationError as error:
-            raise ValueError(one_line(error)) from error
+            raise ValueError(one_line(error, ControllerFile)) from error
 
     def scenarios(self, ekf_slip: SlipEkfParameters | None) -> dict[str, Scenario]:
         """The scenario of every task and disturbance, named ``"task, disturbance"``.
@@ -272,4 +272,4 @@ def load_tune(source: str | Path, *, trials: int | None = None) -> TuneConfig:
         given = {} if trials is None else {"trials": trials}
         return TuneConfig.model_validate(found | given)
     except ValidationError as error:
-        raise ValueError(one_line(error)) from error
+        raise ValueError(one_line(error, TuneConfig)) from error

@@ -12,14 +12,13 @@ from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-import yaml
-
 from baselines.runs.jobs import alone_in, spread
 from baselines.runs.provenance import git_revision, simulation_digest, versions
 from baselines.tuning.config import TuneConfig
 from baselines.tuning.study import StoredStudy, optuna_package
 from baselines.tuning.trial import Outcome, TrialJob, run_trial
 from tlf_env.common.files import atomic
+from tlf_env.common.presets import yaml_text
 
 RESULT_FILE = "tuned.yaml"
 
@@ -130,6 +129,6 @@ def _recorded(outcome: Outcome) -> dict[str, Any]:
 
 
 def _write(result: dict[str, Any], path: Path) -> None:
-    text = yaml.safe_dump(result, sort_keys=False, allow_unicode=True, width=100)
     with atomic(path, encoding="utf-8") as file:
-        file.write("# Found by tlf tune. Use it with --policy reference:FILE.\n" + text)
+        file.write("# Found by tlf tune. Use it with --policy reference:FILE.\n")
+        file.write(yaml_text(result))

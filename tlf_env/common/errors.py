@@ -1,76 +1,220 @@
-"""Validation errors as one line that names the value and what is allowed."""
+"""Errors as one line that names the key with its path, the value, and what is allowed."""
 
 from __future__ import annotations
 
-import re
-from typing import Any
+import difflib
+import types
+from collections.abc import Iterable, Mapping, Sequence
+from typing import (
+    Annotated,
+    Any,
+    NamedTuple,
+    Union,
+    get_args,
+    get_origin,
+)
 
-from pydantic import ValidationError
+from pydantic import BaseModel, ValidationError
 
-# Parts of a location that name a branch of a union and are not keys of the user's data.
-BRANCH = re.compile(r"[A-Z]\w*|(literal|constrained|tuple|function)[-\[].*|int|str")
 LENGTH_ERRORS = ("too_short", "too_long")
 ALLOWED = "Input should be "
+MOST_ERRORS = 6  # named in a line
+FEW_NAMES = 8  # so many allowed names are all listed
+SHOWN = 60  # characters of a value, and of a key
 
 
 class RepeatedKeyError(ValueError):
     """A mapping in a YAML or JSON file has the same key twice."""
 
 
-def one_line(error: ValidationError) -> str:
-    """A validation error as one line: each location, what is wrong there, and the value."""
-    merged: dict[tuple[tuple[str, ...], str], Any] = {}
-    for number, item in enumerate(_relevant(error.errors())):
-        if not item["msg"].startswith(ALLOWED):
-            merged[(str(number),), ""] = item
-            continue
-        same = (_location(item), repr(item["input"]))
-        if same in merged and merged[same]["msg"] != item["msg"]:  # another branch of the union
-            other = item["msg"].removeprefix(ALLOWED)
-            merged[same] = {**merged[same], "msg": f"{merged[same]['msg']}, or {other}"}
+def shown(value: Any) -> str:
+    """A value as one line of at most 60 characters; its type, if it cannot be printed."""
+    try:
+        text = " ".join(repr(value).split())
+    except Exception:  # an object of any library may come here
+        text = f"an object of the type {type(value).__name__}"
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+
+
+def nearest(name: object, allowed: Iterable[str], others: Mapping[str, str] | None = None) -> str:
+    """What might be meant instead of an unknown name: ``"; did you mean 'robots'?"``, or nothing.
+
+    Parameters
+    ----------
+    allowed
+        The names there are. If none is near and they are few, they are all listed.
+    others
+        Hints for names that other libraries use.
+    """
+    names = list(allowed)
+    text = str(name)
+    if others and text in others:
+        return f"; {others[text]}"
+    lower = {one.lower(): one for one in reversed(names)}
+    close = difflib.get_close_matches(text.lower()[:SHOWN], list(lower), 1)
+    if close:
+        return f"; did you mean {lower[close[0]]!r}?"
+    if 0 < len(names) <= FEW_NAMES:
+        return f"; allowed: {', '.join(names)}"
+    return ""
+
+
+class _Found(NamedTuple):
+    """One error of a validation."""
+
+    keys: tuple[str, ...]  # its place in the user's data
+    in_branch: bool  # whether it concerns one branch of a union
+    allowed: tuple[str, ...]  # the keys that exist at the place
+    item: Any  # pydantic's description
+
+
+def one_line(error: ValidationError, kind: Any, hints: Mapping[str, str] | None = None) -> str:
+    """A validation error as one line: each place, what is wrong there, and the value.
+
+    Parameters
+    ----------
+    kind
+        The model or type that was validated. It shows which parts of pydantic's locations are keys of the
+        user's data, and which only name a branch of a union.
+    hints
+        What to say of an unknown key at the top, by key.
+    """
+    found = [_placed(kind, item) for item in error.errors(include_url=False)]
+    merged: dict[Any, tuple[_Found, str]] = {}
+    for number, one in enumerate(_relevant(found)):
+        message = one.item["msg"]
+        same = (one.keys, repr(one.item["input"]))
+        if not message.startswith(ALLOWED):
+            merged[number] = one, message
+        elif same in merged:  # another branch of the union
+            before = merged[same][1]
+            other = message.removeprefix(ALLOWED)
+            if other not in before:
+                merged[same] = one, f"{before}, or {other}"
         else:
-            merged[same] = item
-    return "; ".join(dict.fromkeys(_message(item) for item in merged.values()))
+            merged[same] = one, message
+    lines = list(dict.fromkeys(_message(one, text, hints or {}) for one, text in merged.values()))
+    more = len(lines) - MOST_ERRORS
+    return "; ".join(lines[:MOST_ERRORS]) + (f"; and {more} more errors" if more > 0 else "")
 
 
-def _location(item: Any) -> tuple[str, ...]:
-    return tuple(str(part) for part in item["loc"] if not BRANCH.fullmatch(str(part)))
+def _placed(kind: Any, item: Any) -> _Found:
+    """An error with the keys of its place, found by following the location through the type.
+
+    Wherever the type is a union of two or more, one part of the location names the branch.
+    """
+    kinds = _alternatives(kind)
+    keys: list[str] = []
+    chosen = in_branch = False
+    allowed: tuple[str, ...] = ()
+    location = list(item["loc"])
+    unknown = item["type"] == "extra_forbidden"
+    if item["type"] == "string_type" and location[-1:] == ["[key]"]:
+        location.pop()  # a key is wrong and not its value
+    for number, part in enumerate(location):
+        last = number == len(location) - 1
+        if len(kinds) > 1 and not chosen and not (unknown and last):
+            kinds = [one for one in kinds if _is_branch(one, str(part))] or kinds
+            chosen = in_branch = True
+            continue
+        allowed = tuple(dict.fromkeys(name for one in kinds for name in _fields(one)))
+        keys.append(_key(part))
+        kinds, chosen = _children(kinds, part), False
+    return _Found(tuple(keys), in_branch, allowed if unknown else (), item)
 
 
-def _relevant(items: list[Any]) -> list[Any]:
+def _key(part: object) -> str:
+    """A key as it is printed in a path."""
+    text = str(part)
+    if not text.isprintable() or not text.strip():
+        text = repr(text)
+    return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
+
+
+def _alternatives(kind: Any) -> list[Any]:
+    """The types that a type stands for, without None."""
+    origin = get_origin(kind)
+    if hasattr(kind, "__value__"):  # a type with a name of its own
+        return _alternatives(kind.__value__)
+    if origin is Annotated:
+        return _alternatives(get_args(kind)[0])
+    if origin is Union or origin is types.UnionType:
+        return [one for part in get_args(kind) for one in _alternatives(part)]
+    return [] if kind is types.NoneType else [kind]
+
+
+def _is_branch(kind: Any, label: str) -> bool:
+    """Whether pydantic's name of a branch is that of a type."""
+    if not _is_model(kind):
+        origin = get_origin(kind) or kind
+        return label.startswith(getattr(origin, "__name__", str(origin)).lower())
+    tag = kind.model_fields.get("type")
+    return label == kind.__name__ or (tag is not None and label in get_args(tag.annotation))
+
+
+def _is_model(kind: Any) -> bool:
+    return isinstance(kind, type) and issubclass(kind, BaseModel)
+
+
+def _fields(kind: Any) -> list[str]:
+    return list(kind.model_fields) if _is_model(kind) else []
+
+
+def _children(kinds: Sequence[Any], part: object) -> list[Any]:
+    """The types of what a key or an index leads to."""
+    found: list[Any] = []
+    for kind in kinds:
+        given, origin = get_args(kind), get_origin(kind)
+        if _is_model(kind):
+            field = kind.model_fields.get(part)
+            found += [] if field is None else _alternatives(field.annotation)
+        elif origin is tuple and isinstance(part, int):
+            member = given[0] if given[-1] is ... else given[min(part, len(given) - 1)]
+            found += _alternatives(member)
+        elif origin in (dict, list, Mapping, Sequence) and given:
+            found += _alternatives(given[-1])  # of a dict or a list
+    return [one for place, one in enumerate(found) if one not in found[:place]]
+
+
+def _relevant(items: list[_Found]) -> list[_Found]:
     """The errors without those of union branches that the value was not meant for."""
     kept = []
-    for item in items:
-        wrong_kind = item["type"].endswith("_type")
-        key = item["loc"][:1]
+    for one in items:
+        wrong_kind = _is_wrong_kind(one)
+        key = one.item["loc"][:1]
         others = [
             other
             for other in items
-            if other["loc"][:1] == key
-            and other is not item
-            and (not other["type"].endswith("_type") or len(other["loc"]) > len(item["loc"]))
+            if other.item["loc"][:1] == key
+            and other is not one
+            and (not _is_wrong_kind(other) or len(other.item["loc"]) > len(one.item["loc"]))
             and not _miscounted(other, items)
         ]
-        in_branch = any(BRANCH.fullmatch(str(part)) for part in item["loc"])
-        if not (wrong_kind and in_branch and others) and not _miscounted(item, items):
-            kept.append(item)
+        if not (wrong_kind and one.in_branch and others) and not _miscounted(one, items):
+            kept.append(one)
     return kept
 
 
-def _miscounted(item: Any, items: list[Any]) -> bool:
+def _is_wrong_kind(one: _Found) -> bool:
+    return one.item["type"].endswith("_type")
+
+
+def _miscounted(one: _Found, items: list[_Found]) -> bool:
     """Whether a length error only reports that members of the sequence are invalid."""
-    depth = len(item["loc"])
-    return item["type"] in LENGTH_ERRORS and any(
-        len(other["loc"]) > depth and other["loc"][:depth] == item["loc"] for other in items
+    place = one.item["loc"]
+    depth = len(place)
+    return one.item["type"] in LENGTH_ERRORS and any(
+        len(other.item["loc"]) > depth and other.item["loc"][:depth] == place for other in items
     )
 
 
-def _message(item: Any) -> str:
-    location = ".".join(_location(item))
-    message = item["msg"].removeprefix("Value error, ")
-    value = item["input"]
-    if item["type"] == "extra_forbidden":
-        message = "unknown key"
-    elif item["type"] != "value_error" and not isinstance(value, dict | list):
-        message += f", got {value!r}"
+def _message(one: _Found, message: str, hints: Mapping[str, str]) -> str:
+    location = ".".join(one.keys)
+    message = message.removeprefix("Value error, ")
+    value = one.item["input"]
+    if one.item["type"] == "extra_forbidden":
+        others = hints if len(one.keys) == 1 else {}
+        message = f"unknown key{nearest(one.keys[-1], one.allowed, others)}"
+    elif one.item["type"] != "value_error" and not isinstance(value, dict | list):
+        message += f", got {shown(value)}"
     return f"{location}: {message}" if location else message

@@ -3,22 +3,40 @@
 from __future__ import annotations
 
 import math
+from numbers import Integral, Real
 from typing import Annotated, Any
 
+import numpy as np
 from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+from pydantic_core import PydanticCustomError
 
 
-def no_switch(value: Any) -> Any:
-    """The value; True and False are refused, which Python would take as 1 and 0.
+def is_number(value: Any) -> bool:
+    """Whether a value is one real number, of Python or NumPy; True, False and texts are not."""
+    return isinstance(value, Real) and not isinstance(value, bool)
 
-    Raises
-    ------
-    ValueError
-        for True and False.
-    """
-    if isinstance(value, bool):
-        raise ValueError(f"must be a number, got {value!r}")
-    return value
+
+def _number(value: Any) -> float:
+    if not is_number(value):
+        raise PydanticCustomError("number_type", "Input should be a number")
+    try:
+        return float(value)
+    except OverflowError:
+        return math.inf
+
+
+def _whole_number(value: Any) -> Any:
+    if is_number(value) and isinstance(value, Integral):
+        return int(value)
+    if is_number(value) and float(value).is_integer():
+        return int(value)
+    raise PydanticCustomError("whole_number_type", "Input should be a whole number")
+
+
+def _switch(value: Any) -> bool:
+    if not isinstance(value, bool | np.bool_):
+        raise PydanticCustomError("switch_type", "Input should be True or False")
+    return bool(value)
 
 
 def infinite_if_none(limit: float | None, factor: float = 1.0) -> float:
@@ -26,8 +44,12 @@ def infinite_if_none(limit: float | None, factor: float = 1.0) -> float:
     return math.inf if limit is None else limit * factor
 
 
-Positive = Annotated[FiniteFloat, BeforeValidator(no_switch), Field(gt=0)]
-NonNegative = Annotated[FiniteFloat, BeforeValidator(no_switch), Field(ge=0)]
+# Numbers of Python and NumPy. Switches (which Python would take as 1 and 0), texts and arrays are refused.
+Number = Annotated[FiniteFloat, BeforeValidator(_number)]
+Positive = Annotated[Number, Field(gt=0)]
+NonNegative = Annotated[Number, Field(ge=0)]
+Whole = Annotated[int, BeforeValidator(_whole_number)]
+Switch = Annotated[bool, BeforeValidator(_switch)]
 
 
 class Frozen(BaseModel):

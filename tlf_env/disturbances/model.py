@@ -10,9 +10,9 @@ import math
 from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
-from pydantic import BeforeValidator, FiniteFloat, model_validator
+from pydantic import BeforeValidator, model_validator
 
-from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.models import Frozen, NonNegative, Number, Positive, is_number
 from tlf_env.disturbances.channels import CHANNELS, PATHS, SUBSTEP, number, numbers
 from tlf_env.disturbances.signals import Constant, Signal
 from tlf_env.numerics.compiled import law
@@ -20,7 +20,7 @@ from tlf_env.physics.vehicle import Body, Motion
 
 
 def _plain_number(value: Any) -> Any:
-    if isinstance(value, int | float) and not isinstance(value, bool):
+    if is_number(value):
         return {"type": "constant", "value": value}
     return value
 
@@ -42,8 +42,8 @@ class SlipChannels(Frozen):
 class Patch(Frozen):
     """A disc on the floor where the tyres' friction is scaled."""
 
-    x_mm: FiniteFloat
-    y_mm: FiniteFloat
+    x_mm: Number
+    y_mm: Number
     radius_mm: Positive
     friction_scale: NonNegative
 

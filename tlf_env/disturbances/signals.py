@@ -5,9 +5,9 @@ from __future__ import annotations
 import math
 from typing import Annotated, Literal, NamedTuple, Self
 
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, model_validator
 
-from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.models import Frozen, NonNegative, Number, Positive
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.philox import normal_pair, unit, words
 
@@ -50,7 +50,7 @@ class Constant(_Signal):
     """The same value always."""
 
     type: Literal["constant"] = "constant"
-    value: FiniteFloat
+    value: Number
 
     def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
@@ -69,9 +69,9 @@ class Step(_Signal):
     """``before`` until ``at_s``, then ``value``."""
 
     type: Literal["step"] = "step"
-    value: FiniteFloat
+    value: Number
     at_s: NonNegative
-    before: FiniteFloat | None = None  # None: the channel's nominal value
+    before: Number | None = None  # None: the channel's nominal value
 
     def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
@@ -87,10 +87,10 @@ class Impulse(_Signal):
     """``value`` from ``at_s`` on for ``duration_s``, ``rest`` otherwise."""
 
     type: Literal["impulse"] = "impulse"
-    value: FiniteFloat
+    value: Number
     at_s: NonNegative
     duration_s: Positive
-    rest: FiniteFloat | None = None  # None: the channel's nominal value
+    rest: Number | None = None  # None: the channel's nominal value
 
     def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`; the duration travels in ``every`` as seconds."""
@@ -106,10 +106,10 @@ class Sine(_Signal):
     """``mean`` + ``amplitude`` · sin(2π ``frequency_hz`` t + ``phase_rad``)."""
 
     type: Literal["sine"] = "sine"
-    amplitude: FiniteFloat
+    amplitude: Number
     frequency_hz: Positive
-    phase_rad: FiniteFloat = 0.0
-    mean: FiniteFloat | None = None  # None: the channel's nominal value
+    phase_rad: Number = 0.0
+    mean: Number | None = None  # None: the channel's nominal value
 
     def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`; the mean travels in ``every``."""
@@ -138,8 +138,8 @@ class Uniform(_Drawn):
     """Drawn evenly between ``low`` and ``high``, anew ``every_s``, or once per episode."""
 
     type: Literal["uniform"] = "uniform"
-    low: FiniteFloat
-    high: FiniteFloat
+    low: Number
+    high: Number
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -161,7 +161,7 @@ class Gaussian(_Drawn):
 
     type: Literal["gaussian"] = "gaussian"
     std: NonNegative
-    mean: FiniteFloat | None = None  # None: the channel's nominal value
+    mean: Number | None = None  # None: the channel's nominal value
 
     def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
@@ -179,7 +179,7 @@ class OrnsteinUhlenbeck(_Signal):
     type: Literal["ornstein_uhlenbeck"] = "ornstein_uhlenbeck"
     std: NonNegative
     time_constant_s: Positive
-    mean: FiniteFloat | None = None  # None: the channel's nominal value
+    mean: Number | None = None  # None: the channel's nominal value
 
     def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""

@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from tlf_env.common.errors import shown
 from tlf_env.engine import drivers, judging, readout
 from tlf_env.engine.arrays import Arrays, make_arrays, make_variants
 from tlf_env.engine.excerpt import Excerpt, empty_excerpt
@@ -21,6 +22,7 @@ from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.start import Start, start_options
+from tlf_env.task.warn import warn_of
 
 Source = str | Path | Mapping[str, Any] | Scenario
 
@@ -69,6 +71,7 @@ class BatchPlant:
         if not isinstance(scenario, Sequence) or isinstance(scenario, str):
             scenario = [scenario]
         self.scenarios = _alike([_for_lanes(source, overrides) for source in scenario])
+        warn_of(self.scenarios)
         self.formations = checked_count("formations", formations)
         self.threads = checked_count("threads", os.cpu_count() or 1 if threads is None else threads)
         table = reference_table(self.scenario)
@@ -81,6 +84,7 @@ class BatchPlant:
         self._poses = NO_POSES  # start poses of the present episodes, if any are given
         self._nothing = empty_excerpt(self.arrays, 0, 0)
         self._pool: ThreadPoolExecutor | None = None
+        self._pool_pid = 0
 
     @property
     def scenario(self) -> Scenario:
@@ -223,8 +227,7 @@ class BatchPlant:
         given = real_numbers(actions)
         if given is None:
             raise ValueError(
-                f"actions must be real numbers in the shape {arrays.actions.shape}, got "
-                f"{' '.join(repr(actions).split()):.60}"
+                f"actions must be real numbers in the shape {arrays.actions.shape}, got {shown(actions)}"
             )
         if given.shape != arrays.actions.shape:
             raise ValueError(
@@ -248,9 +251,9 @@ class BatchPlant:
             helper.result()
 
     def _others(self) -> ThreadPoolExecutor:
-        """The other threads, kept from step to step."""
-        if self._pool is None:
-            self._pool = ThreadPoolExecutor(self.threads - 1)
+        """The other threads, kept from step to step; a forked child has to start its own."""
+        if self._pool is None or self._pool_pid != os.getpid():
+            self._pool, self._pool_pid = ThreadPoolExecutor(self.threads - 1), os.getpid()
         return self._pool
 
     @property

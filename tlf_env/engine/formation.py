@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 import pymunk
 
+from tlf_env.common.errors import shown
 from tlf_env.disturbances.channels import (
     CHANNELS,
     PAYLOAD_BEHIND,
@@ -24,7 +25,7 @@ from tlf_env.engine.outside_parts import Parts, part_factories
 from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.onboard.observer import Reference
-from tlf_env.onboard.parts import Factory
+from tlf_env.onboard.parts import Factory, real_numbers
 from tlf_env.physics.pymunk_plant import PymunkPlant
 from tlf_env.physics.vehicle import Body
 from tlf_env.task.info import Info
@@ -43,6 +44,17 @@ def reference_table(scenario: Scenario, phase_s: float = 0.0) -> np.ndarray:
 STATE_SCALES = np.array(
     [1000.0, 1000.0, 1.0, 1.0, 1.0, 500.0, 500.0, 2.0, 10.0, 10.0, 1000.0, 1000.0]
 )
+# No entry, so divided, is ever larger: a sine, an angle, and elsewhere far more than a model can reach.
+STATE_LIMITS = np.array([1e12, 1e12, 1.0, 1.0, np.pi, 1e12, 1e12, 1e12, 1e12, 1e12, 1e12, 1e12])
+STATE_ROUNDING_MM = 0.01  # of a position; float32 is not enough where it would round by more
+
+
+def state_dtype(scenario: Scenario, path: np.ndarray) -> np.dtype:
+    """The dtype of the scaled state: float32, unless the scenario or a ``path`` far away wants float64."""
+    farthest = np.float32(np.abs(path).max() / STATE_SCALES[0])
+    rounding_mm = float(np.spacing(farthest)) / 2 * STATE_SCALES[0]
+    exact = scenario.dtype == "float64" or rounding_mm > STATE_ROUNDING_MM
+    return np.dtype(np.float64 if exact else np.float32)
 
 
 USUAL_START = Start(poses=None, phases_s=None)
@@ -131,10 +143,10 @@ class Formation:
             high = channel.high
             if path == "actuator.computing_delay_s":
                 high = min(high, self.scenario.control_period_s)
-            row = np.asarray(value, dtype=np.float64)
-            if row.shape not in ((), (robots,)):
+            row = real_numbers(value)
+            if row is None or row.shape not in ((), (robots,)):
                 raise ValueError(
-                    f"{path} must be a number or one per robot ({robots}), got {value!r}"
+                    f"{path} must be a number or one per robot ({robots}), got {shown(value)}"
                 )
             if not ((row >= channel.low) & (row <= high)).all():
                 raise ValueError(
@@ -175,6 +187,8 @@ class Formation:
     def _substep_by_substep(self, close: bool) -> None:
         arrays, settings = self.arrays, self._settings
         motion = arrays.rows("motion")
+        if close:
+            self.plant.sort(motion)
         for substep in range(settings.substeps):
             self._parts.drive(arrays, substep, settings)
             before = motion.copy() if close else motion

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import secrets
-import sys
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,8 +14,9 @@ from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
+from tlf_env.common.errors import shown
 from tlf_env.disturbances.model import PatchRow, patch_rows
-from tlf_env.engine.formation import STATE_SCALES, Formation
+from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, state_dtype
 from tlf_env.engine.judging import terminated, truncated
 from tlf_env.engine.readout import info_rows
 from tlf_env.envs.spec import documented
@@ -25,29 +24,16 @@ from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import Factory, part_name, real_numbers
 from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.info import INFO_KEYS, InfoChoice, State, chosen_keys
+from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
-from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
+from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.start import start_options
+from tlf_env.task.warn import ReferenceWarning as ReferenceWarning
+from tlf_env.task.warn import warn_of
 
 Agent = str
 Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
 PETTINGZOO_TEST_OPTION = "options"  # PettingZoo's API test passes this option; it is ignored
-
-
-MAKERS = ("tlf_env", "gymnasium", "pettingzoo")  # packages between a caller and the environment
-
-
-class ReferenceWarning(UserWarning):
-    """The reference exceeds limits of the robots or of the observation."""
-
-
-def callers_level() -> int:
-    """``stacklevel`` of a warning by the calling function: the first frame outside :data:`MAKERS`."""
-    level, frame = 1, sys._getframe(1)
-    while frame.f_back is not None and frame.f_globals.get("__name__", "").split(".")[0] in MAKERS:
-        level, frame = level + 1, frame.f_back
-    return level
 
 
 @documented
@@ -102,8 +88,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self._info_keys = chosen_keys(infos)
         self._pick = [INFO_KEYS.index(key) for key in self._info_keys]
         self._scenario = load_scenario(scenario, **overrides)
-        for line in scenario_warnings(self.scenario):
-            warnings.warn(line, ReferenceWarning, stacklevel=callers_level())
+        warn_of([self.scenario])
         self.metadata: dict[str, Any] = {
             "name": f"tlf_env/{self.scenario.name}-v0",
             "render_modes": list(RENDER_MODES),
@@ -129,8 +114,10 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             agent: gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), dtype.type)
             for agent in self.possible_agents
         }
+        limits = np.tile(STATE_LIMITS, len(self.possible_agents))
+        dtype = state_dtype(self.scenario, self._formation.leader_path())
         self.state_space = gymnasium.spaces.Box(
-            -np.inf, np.inf, (len(self.possible_agents) * len(State._fields),), np.float32
+            -limits.astype(dtype), limits.astype(dtype), dtype=dtype.type
         )
         self._adversary = adversary
         self._renderer: Any = None
@@ -254,7 +241,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
 
     def _take(self, actions: dict[Agent, np.ndarray]) -> None:
         buffer = self._formation.arrays.actions[0]
-        if len(actions) != len(self.agents):
+        if not isinstance(actions, Mapping) or len(actions) != len(self.agents):
             self._complain(actions)
         for i, agent in enumerate(self.agents):
             try:
@@ -264,8 +251,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             numbers = real_numbers(action)
             if numbers is None:
                 raise ValueError(
-                    f"{agent}: the action must be {ACTION_SIZE} numbers, got "
-                    f"{' '.join(repr(action).split())}"
+                    f"{agent}: the action must be {ACTION_SIZE} numbers, got {shown(action)}"
                 )
             if numbers.shape != (ACTION_SIZE,):
                 raise ValueError(
@@ -273,7 +259,12 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                 )
             buffer[i] = numbers
 
-    def _complain(self, actions: dict[Agent, np.ndarray]) -> None:
+    def _complain(self, actions: Any) -> None:
+        if not isinstance(actions, Mapping):
+            raise ValueError(
+                f"actions must be a mapping {{agent: {ACTION_SIZE} numbers}} with the agents "
+                f"{', '.join(self.agents)}, got {shown(actions)}"
+            )
         unknown = [agent for agent in actions if agent not in self.agents]
         missing = [agent for agent in self.agents if agent not in actions]
         what = f"{unknown[0]!r} is not an agent" if unknown else f"no action for {missing[0]}"
@@ -299,8 +290,13 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return dict(zip(self.possible_agents, named, strict=True))
 
     def state(self) -> np.ndarray:
-        """The true state for critics, float32: scaled :class:`tlf_env.task.info.State` of every robot."""
-        return (self._formation.state() / STATE_SCALES).astype(np.float32).ravel()
+        """The true state for critics: scaled :class:`tlf_env.task.info.State` of every robot.
+
+        float32; but float64 if the scenario's ``dtype`` is, or if the reference path lies so far from the
+        origin (some 260 m) that float32 would round a position by more than 0.01 mm.
+        """
+        scaled = self._formation.state() / STATE_SCALES
+        return scaled.astype(self.state_space.dtype).ravel()
 
     def render(self) -> np.ndarray | None:
         """A frame ``(height, width, 3)`` uint8 in mode ``rgb_array``; None in mode ``human``.

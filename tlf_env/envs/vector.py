@@ -14,6 +14,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
+from tlf_env.common.errors import shown
 from tlf_env.engine import judging
 from tlf_env.engine.batch import BatchPlant, checked_count
 from tlf_env.engine.excerpt import END_ROW, REWARD_ROW, Excerpt
@@ -24,6 +25,7 @@ from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.start import start_options
+from tlf_env.task.warn import without_warnings
 
 RESET_MASK = "reset_mask"
 
@@ -88,7 +90,8 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if max_episode_steps is not None:
             steps = checked_count("max_episode_steps", max_episode_steps)
             if steps < self.plant.scenario.horizon_steps:
-                self.plant = make(horizon_s=steps * self.plant.scenario.control_period_s)
+                with without_warnings():
+                    self.plant = make(horizon_s=steps * self.plant.scenario.control_period_s)
         self._info_keys = chosen_keys(infos)
         self._mask_keys = [f"_{key}" for key in self._info_keys]
         self._info_rows = [INFO_KEYS.index(key) for key in self._info_keys]
@@ -206,7 +209,8 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         given = real_numbers(actions)
         if given is None:
             raise ValueError(
-                f"actions must be real numbers, got {' '.join(repr(actions).split()):.60}"
+                f"actions must be real numbers in the shape {self._actions[:, self._robot].shape}, got "
+                f"{shown(actions)}"
             )
         if given.shape != self._actions[:, self._robot].shape:
             raise ValueError(

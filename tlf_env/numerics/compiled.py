@@ -15,7 +15,10 @@ from __future__ import annotations
 import functools
 import hashlib
 import os
+import pickle
+import stat
 import tempfile
+import warnings
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
@@ -23,13 +26,32 @@ from typing import Any, TypeVar
 import numba
 import platformdirs
 from numba.core import types
+from numba.core.caching import (
+    CompileResultCacheImpl,
+    FunctionCache,
+    IndexDataCacheFile,
+    NullCache,
+    UserProvidedCacheLocator,
+)
 from numba.core.cgutils import create_struct_proxy
+from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
 F = TypeVar("F", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).resolve().parent.parent
+DIGEST_BYTES = hashlib.sha256().digest_size
 ROOMS_WITH_LAWS = ("numerics", "physics", "onboard", "disturbances", "task", "engine")
+
+
+if hasattr(os, "register_at_fork"):
+    # A child has only the thread that forked: a lock that another one held would stay locked for ever.
+    # So a fork waits until no other thread compiles.
+    os.register_at_fork(
+        before=global_compiler_lock.acquire,
+        after_in_parent=global_compiler_lock.release,
+        after_in_child=global_compiler_lock.release,
+    )
 
 
 @functools.cache
@@ -44,22 +66,30 @@ def sources_digest() -> str:
 
 
 @functools.cache
-def cache_folder() -> Path:
+def cache_folder() -> Path | None:
     """Folder of the compiled drivers; ``TLF_ENV_CACHE`` names another parent.
 
-    Falls back to a private folder below the system's temporary one where the user's cache cannot be
-    written, so that a driver is compiled once per machine and not once per process.
+    It may be one that can only be read, if something was compiled into it before. Otherwise, where the
+    user's cache cannot be written, it is a private folder below the system's temporary one, so that a
+    driver is compiled once per machine and not once per process. None if that cannot be written either.
     """
-    parent = os.environ.get("TLF_ENV_CACHE") or platformdirs.user_cache_dir("tlf_env")
-    folder = Path(parent) / sources_digest()
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        with tempfile.TemporaryFile(dir=folder):
-            return folder
-    except OSError:
-        folder = _temporary_folder() / sources_digest()
-        folder.mkdir(mode=0o700, exist_ok=True)
-        return folder
+    for parent, mode in ((_named_folder, 0o755), (_temporary_folder, 0o700)):
+        try:
+            folder = parent() / sources_digest()
+            if not folder.is_dir():
+                folder.mkdir(mode, parents=True, exist_ok=True)
+            if _only_mine(folder) and (_writable(folder) or any(folder.rglob("*.nbi"))):
+                return folder
+        except OSError:
+            continue
+    return None
+
+
+def _named_folder() -> Path:
+    folder = Path(os.environ.get("TLF_ENV_CACHE") or platformdirs.user_cache_dir("tlf_env"))
+    if str(folder).startswith("~"):  # a user without a home
+        raise FileNotFoundError(folder)
+    return folder
 
 
 def _temporary_folder() -> Path:
@@ -67,11 +97,126 @@ def _temporary_folder() -> Path:
     user = os.getuid() if hasattr(os, "getuid") else "user"
     folder = Path(tempfile.gettempdir()) / f"tlf_env-{user}"
     folder.mkdir(mode=0o700, exist_ok=True)
+    if _only_mine(folder):
+        return folder
+    return Path(tempfile.mkdtemp(prefix="tlf_env-"))
+
+
+def _only_mine(folder: Path) -> bool:
+    """Whether only this user, or root, may write in a folder: what lies in it is run."""
+    if not hasattr(os, "getuid"):
+        return True
     status = folder.stat(follow_symlinks=False)
-    mine = not hasattr(os, "getuid") or (
-        status.st_uid == os.getuid() and not status.st_mode & 0o022
+    return (
+        stat.S_ISDIR(status.st_mode)
+        and status.st_uid in (os.getuid(), 0)
+        and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
     )
-    return folder if mine and not folder.is_symlink() else Path(tempfile.mkdtemp(prefix="tlf_env-"))
+
+
+def _writable(folder: Path) -> bool:
+    try:
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False
+
+
+@functools.cache
+def _warn_that_nothing_is_kept(folder: Path | None) -> None:
+    """Once in a process."""
+    where = f"in {folder}" if folder else "in the user's cache or a temporary folder"
+    warnings.warn(
+        f"compiled code could not be kept {where}, so that every new process compiles it again, in "
+        "about a minute; the variable TLF_ENV_CACHE names another folder",
+        RuntimeWarning,
+        stacklevel=2,
+    )
+
+
+class _NothingKept(NullCache):
+    """For a machine without a folder that can be written."""
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        _warn_that_nothing_is_kept(None)
+
+
+class _Locator(UserProvidedCacheLocator):
+    """Where Numba keeps a driver: in :func:`cache_folder`, which need not be writable."""
+
+    def __init__(self, function: Callable[..., Any], file: str) -> None:
+        super().__init__(function, file)
+        self._cache_path = str(cache_folder() / self.get_suitable_cache_subpath(file))
+
+    @classmethod
+    def from_function(cls, function: Callable[..., Any], file: str) -> _Locator | None:
+        return cls(function, file) if Path(file).exists() else None
+
+    def ensure_cache_path(self) -> None:
+        Path(self._cache_path).mkdir(mode=0o755, parents=True, exist_ok=True)
+
+
+class _Implementation(CompileResultCacheImpl):
+    _locator_classes = (_Locator, *CompileResultCacheImpl._locator_classes)  # the others: notebooks
+
+
+class _Files(IndexDataCacheFile):
+    """Numba's files, objects behind a digest of their content and with the key that they belong to.
+
+    A file may have been cut short on a full disk; and of two processes that add to an index at once, one
+    overwrites the other's line, so that an object may belong to another key.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        super().save(key, (key, data))
+
+    def load(self, key: Any) -> Any:
+        saved = super().load(key)
+        return saved[1] if saved is not None and saved[0] == key else None
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            index = super()._load_index()
+        except Exception:  # anything may happen when a broken file is read
+            return {}
+        return index if isinstance(index, dict) else {}
+
+    def _load_data(self, name: str) -> Any:
+        content = Path(self._data_path(name)).read_bytes()
+        digest, packed = content[:DIGEST_BYTES], content[DIGEST_BYTES:]
+        if hashlib.sha256(packed).digest() != digest:
+            raise OSError(f"{name} is broken")  # Numba compiles what it cannot read
+        return pickle.loads(packed)
+
+    def _save_data(self, name: str, data: Any) -> None:
+        packed = self._dump(data)
+        with self._open_for_write(self._data_path(name)) as file:
+            file.write(hashlib.sha256(packed).digest() + packed)
+
+
+class _Cache(FunctionCache):
+    """Numba's cache of a driver. It only saves time: what cannot be read is compiled, and kept if possible."""
+
+    _impl_class = _Implementation
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        locator = self._impl.locator
+        self._cache_file = _Files(
+            self._cache_path, self._impl.filename_base, locator.get_source_stamp()
+        )
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        try:
+            return super().load_overload(sig, target_context)
+        except Exception:  # as above
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        try:
+            super().save_overload(sig, data)
+        except OSError:
+            _warn_that_nothing_is_kept(cache_folder())
 
 
 def law(function: F) -> F:
@@ -112,12 +257,10 @@ def allocating(function: F) -> F:
 
 def driver(function: F) -> F:
     """Compile a function over arrays, and keep the result on disk."""
-    before = numba.config.CACHE_DIR
-    numba.config.CACHE_DIR = str(cache_folder())  # read when the cache object is made, just below
-    try:
-        compiled: F = numba.njit(error_model="numpy", nogil=True, cache=True)(function)
-    finally:
-        numba.config.CACHE_DIR = before
+    dispatcher: Any = numba.njit(error_model="numpy", nogil=True)(function)
+    if dispatcher is not function:  # as it is where Numba is switched off
+        dispatcher._cache = _NothingKept() if cache_folder() is None else _Cache(function)
+    compiled: F = dispatcher
     return compiled
 
 

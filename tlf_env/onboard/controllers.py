@@ -67,7 +67,7 @@ def _loaded(source: str | Path) -> ControllerFile:
     try:
         return ControllerFile.model_validate(read_preset_or_file("controller", source))
     except ValidationError as error:
-        raise ValueError(f"{source}: {one_line(error)}") from error
+        raise ValueError(f"{source}: {one_line(error, ControllerFile)}") from error
 
 
 def controller(source: str | Path) -> Controller:

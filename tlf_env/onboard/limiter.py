@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from tlf_env.common.models import Frozen, NonNegative, Positive, infinite_if_none
+from tlf_env.common.models import Frozen, NonNegative, Positive, Switch, infinite_if_none
 from tlf_env.numerics.compiled import law
 
 
@@ -30,7 +30,7 @@ class TwistLimits(Frozen):
     free_speed_mm_s: NonNegative = 0.0
     free_reach_mm: Positive = 30.0
     reverse_mm_s: NonNegative | None = None  # of u₁ backward
-    cancel_slip: bool = False  # subtract the estimated slip from the wheels' twist
+    cancel_slip: Switch = False  # subtract the estimated slip from the wheels' twist
 
 
 class TwistLimitsRow(NamedTuple):

@@ -16,6 +16,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from tlf_env.common.errors import shown
 from tlf_env.onboard.observer import Message, Reference
 
 PART_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_<][\w.<>]*$"  # <locals>, <lambda>: given as objects
@@ -166,7 +167,7 @@ def real_numbers(value: Any) -> np.ndarray | None:
     try:
         array = np.asarray(value)
         return array.astype(np.float64) if array.dtype.kind in "biuf" else None
-    except (TypeError, ValueError):
+    except Exception:  # a tensor raises any kind, for example if it has a gradient
         return None
 
 
@@ -186,8 +187,7 @@ def predicted(answer: Any, shape: tuple[int, ...], policy: str) -> tuple[np.ndar
     actions = real_numbers(answer[0])
     if actions is None:
         raise ValueError(
-            f"{policy}: the actions must be real numbers in the shape {shape}, got "
-            f"{' '.join(repr(answer[0]).split()):.60}"
+            f"{policy}: the actions must be real numbers in the shape {shape}, got {shown(answer[0])}"
         )
     if actions.shape != shape:
         raise ValueError(f"{policy}: the actions must have the shape {shape}, got {actions.shape}")
@@ -202,10 +202,7 @@ def finite(value: Any, size: int, what: str) -> np.ndarray:
     ValueError
         naming the part, if the shape is wrong or a number is not finite.
     """
-    try:
-        array = np.asarray(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        array = np.empty(0)
-    if array.shape != (size,) or not np.isfinite(array).all():
-        raise ValueError(f"{what} must return {size} finite numbers, got {value!r}")
+    array = real_numbers(value)
+    if array is None or array.shape != (size,) or not np.isfinite(array).all():
+        raise ValueError(f"{what} must return {size} finite numbers, got {shown(value)}")
     return array

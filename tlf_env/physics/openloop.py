@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import json
 import math
 from pathlib import Path
 from typing import Annotated, Any, Self
@@ -11,9 +10,9 @@ from typing import Annotated, Any, Self
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from tlf_env.common.errors import RepeatedKeyError, one_line
-from tlf_env.common.files import FILE_NAME, atomic
-from tlf_env.common.models import Frozen
+from tlf_env.common.errors import one_line
+from tlf_env.common.files import FILE_NAME, atomic, read_json
+from tlf_env.common.models import Frozen, Number, Switch
 from tlf_env.numerics.compiled import driver
 from tlf_env.physics.kernel import substep
 from tlf_env.physics.parameters import RobotParameters, body_array
@@ -51,7 +50,6 @@ MAX_SUBSTEPS = 100_000_000
 MAX_MM = 1e9  # and mm/s
 MAX_RAD = 1e4  # and rad/s
 
-Number = Annotated[float, Field(strict=True, allow_inf_nan=False)]
 Torque = Annotated[Number, Field(ge=-MAX_TORQUE_NMM, le=MAX_TORQUE_NMM)]
 Length = Annotated[Number, Field(ge=-MAX_MM, le=MAX_MM)]
 Angle = Annotated[Number, Field(ge=-MAX_RAD, le=MAX_RAD)]
@@ -85,7 +83,7 @@ class OpenLoopScenario(Frozen):
 
     duration_s: Annotated[Number, Field(gt=0, le=MAX_DURATION_S)]
     start: OpenLoopStart = OpenLoopStart()
-    joint_friction: bool = True
+    joint_friction: Switch = True
     inputs: tuple[OpenLoopInput, ...] = Field(min_length=1)
 
     @model_validator(mode="after")
@@ -214,16 +212,6 @@ def run_open_loop(
     return np.array(rows)
 
 
-def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """A JSON object; the standard reader keeps the last of two equal keys without an error."""
-    found: dict[str, Any] = {}
-    for key, value in pairs:
-        if key in found:
-            raise RepeatedKeyError(f"the key {key!r} is repeated")
-        found[key] = value
-    return found
-
-
 def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
     """Read ``{name: scenario}`` from a JSON file.
 
@@ -232,15 +220,7 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
     ValueError
         in one line, if the file is missing, is not JSON, or contains an invalid scenario.
     """
-    try:
-        text = path.read_text(encoding="utf-8")
-        data: Any = json.loads(text, object_pairs_hook=_without_repeats)
-    except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from error
-    except RepeatedKeyError as error:
-        raise ValueError(f"{path}: {error}") from error
-    except (ValueError, RecursionError) as error:
-        raise ValueError(f"{path} is not JSON: {error}") from error
+    data: Any = read_json(path)
     if not isinstance(data, dict) or not data:
         raise ValueError(
             f"{path} must contain an object of named scenarios, got {type(data).__name__}"
@@ -248,10 +228,11 @@ def load_scenarios(path: Path) -> dict[str, OpenLoopScenario]:
     for name in data:
         if not FILE_NAME.fullmatch(name):
             raise ValueError(f"{path}: the scenario name {name!r} cannot be a file name")
+    kind = dict[str, OpenLoopScenario]
     try:
-        return TypeAdapter(dict[str, OpenLoopScenario]).validate_python(data)
+        return TypeAdapter(kind).validate_python(data)
     except ValidationError as error:
-        raise ValueError(f"{path}: {one_line(error)}") from error
+        raise ValueError(f"{path}: {one_line(error, kind)}") from error
 
 
 def write_rows(path: Path, rows: np.ndarray) -> Path:

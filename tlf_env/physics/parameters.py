@@ -8,9 +8,9 @@ from __future__ import annotations
 from typing import Annotated, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, FiniteFloat, model_validator
+from pydantic import Field, model_validator
 
-from tlf_env.common.models import Frozen, NonNegative, Positive
+from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch
 from tlf_env.numerics.compiled import law
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
@@ -50,7 +50,7 @@ class JointFriction(FrictionCurve):
     pin_radius_mm: NonNegative  # R_p, lever of the radial force
     bending_arm_mm: Positive  # R_b, divides the bending moment
     preload_Nmm: NonNegative = 0.0  # T_pre; off in Table I
-    bending: bool = True  # friction from the bending moment; on in Table I
+    bending: Switch = True  # friction from the bending moment; on in Table I
 
 
 def _joint(
@@ -89,8 +89,8 @@ class RobotParameters(Frozen):
     wheel_inertia_kg_mm2: Positive = 52.91
     gravity_mm_s2: Positive = 9807.0
     # Section II-B: 0.8 of the weight on the drive wheels, 0.2 on the castor
-    drive_load_share: Annotated[FiniteFloat, Field(gt=0, le=0.5)] = 0.4
-    castor_load_share: Annotated[FiniteFloat, Field(ge=0, lt=1)] = 0.2
+    drive_load_share: Annotated[Number, Field(gt=0, le=0.5)] = 0.4
+    castor_load_share: Annotated[Number, Field(ge=0, lt=1)] = 0.2
     # chosen
     body_inertia_kg_mm2: Positive = 6197.0
     com_offset_mm: NonNegative = 20.0
@@ -100,7 +100,7 @@ class RobotParameters(Frozen):
     castor_inertia_kg_mm2: Positive = 4.0
     fork_inertia_kg_mm2: Positive = 20.0
     outline_radius_mm: Positive = 110.0
-    outline_offset_mm: FiniteFloat = 30.0  # centre of the outline's circle, behind c
+    outline_offset_mm: Number = 30.0  # centre of the outline's circle, behind c
     # footnote 4
     torque_limit_Nmm: Positive = 15.0
     # Table I; it does not give the tyres' v_d: 1.5 v_s, as for the joints
@@ -110,7 +110,7 @@ class RobotParameters(Frozen):
     drive_joint: JointFriction = _joint(0.15, 0.1, (12.0, 8.0, 36.0))
     castor_joint: JointFriction = _joint(0.15, 0.1, (6.2, 3.025, 30.0))
     steering_joint: JointFriction = _joint(0.05, 0.033, (2.5, 2.5, 3.0))
-    joint_friction: bool = True  # False turns eq. (5) off for all joints
+    joint_friction: Switch = True  # False turns eq. (5) off for all joints
 
     @property
     def outline_front_mm(self) -> float:

@@ -7,7 +7,8 @@ are close, each substep runs through the space, and only robots that a contact h
 
 from __future__ import annotations
 
-from typing import Any
+from functools import partial
+from typing import Any, NamedTuple
 
 import numpy as np
 import pymunk
@@ -18,10 +19,19 @@ from tlf_env.physics.state import Motion
 ITERATIONS = 20
 COLLISION_SLOP_MM = 0.1
 CONTACT_FRICTION = 0.0
+SEPARATED = 3  # Chipmunk's state of a contact that has ended, and is remembered for some steps
 
 X, Y, THETA, V_X, V_Y, YAW = (
     Motion._fields.index(name) for name in ("x", "y", "theta", "v_x", "v_y", "w")
 )
+
+
+class Correction(NamedTuple):
+    """A velocity that Chipmunk adds to a body's own in the next step only."""
+
+    x: float  # mm/s
+    y: float
+    turning: float  # rad/s
 
 
 class PymunkPlant:
@@ -55,6 +65,7 @@ class PymunkPlant:
         self._number = {body: i for i, body in enumerate(self._bodies)}
         self._moved: set[int] = set()
         self._moved_before: set[int] = set()
+        self._corrections: list[Correction] = []
         self._space = space
 
     def _remember(self, arbiter: pymunk.Arbiter, _space: pymunk.Space, _data: Any) -> None:
@@ -76,6 +87,25 @@ class PymunkPlant:
             body.velocity = velocities[V_X, i, 0], velocities[V_Y, i, 0]
             body.angular_velocity = velocities[YAW, i, 0]
 
+    def sort(self, motions: np.ndarray) -> None:
+        """Make the space's index of outlines anew, robot by robot; to be called before a control step.
+
+        The order in which Chipmunk solves contacts comes from that index, which otherwise depends on all
+        that happened before, even on whether :meth:`space` was read. A body that changes its
+        type leaves the index and enters it again, and keeps its contacts. Two robots have only one.
+        """
+        if len(self._bodies) <= 2:
+            return
+        for body in self._bodies:
+            body.body_type = pymunk.Body.STATIC
+        self._write(motions, motions)
+        for body, row in zip(self._bodies, self._constants.T.tolist(), strict=True):
+            robot = Body(*row)
+            for outline in body.shapes:
+                outline.cache_bb()
+            body.body_type = pymunk.Body.DYNAMIC
+            body.mass, body.moment = robot.m, robot.I
+
     def collide(self, before: np.ndarray, motions: np.ndarray, dt: float) -> None:
         """Run one substep of the space: from the poses ``before`` with the velocities of ``motions``.
 
@@ -85,7 +115,10 @@ class PymunkPlant:
         """
         self._write(before, motions)
         self._moved_before, self._moved = self._moved, set()
-        self._space.step(dt)
+        if self._corrections:
+            self._step_after_a_copy(dt)
+        else:
+            self._space.step(dt)
         for i in self._moved | self._moved_before:
             body = self._bodies[i]
             motions[X, i, 0], motions[Y, i, 0] = body.position
@@ -93,8 +126,52 @@ class PymunkPlant:
             motions[V_X, i, 0], motions[V_Y, i, 0] = body.velocity
             motions[YAW, i, 0] = body.angular_velocity
 
-    def __getstate__(self) -> dict[str, Any]:
-        return {"constants": self._constants}
+    def _step_after_a_copy(self, dt: float) -> None:
+        """A step of the space that puts back what a copy leaves out, in the original as in the copy."""
+        ended = [each for each in self._space._get_arbiters() if each.state == SEPARATED]
 
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        self.reset(state["constants"])
+        def advance(correction: Correction, body: pymunk.Body, dt: float) -> None:
+            for arbiter in ended:  # a copied space begins its step as if all contacts lasted
+                arbiter.state = SEPARATED
+            _advance_corrected(correction, body, dt)
+
+        for body, correction in zip(self._space.bodies, self._corrections, strict=True):
+            body.position_func = partial(advance, correction)
+        self._space.step(dt)
+        for body in self._space.bodies:
+            body.position_func = pymunk.Body.update_position
+        self._corrections = []
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
+        if not self._corrections:
+            self._corrections = [_take_correction(body) for body in self._space.bodies]
+        return self.__dict__.copy()
+
+
+def _take_correction(body: pymunk.Body) -> Correction:
+    """The velocity with which Chipmunk's next step will push a body out of an overlap, taken from it.
+
+    pymunk has no property for it. But a body at rest at the origin goes just that far in one second.
+    """
+    pose, twist = (body.position, body.angle), (body.velocity, body.angular_velocity)
+    body.position, body.angle, body.velocity, body.angular_velocity = (
+        (0.0, 0.0),
+        0.0,
+        (0.0, 0.0),
+        0.0,
+    )
+    pymunk.Body.update_position(body, 1.0)
+    correction = Correction(*body.position, body.angle)
+    body.position, body.angle = pose
+    body.velocity, body.angular_velocity = twist
+    return correction
+
+
+def _advance_corrected(correction: Correction, body: pymunk.Body, dt: float) -> None:
+    """Chipmunk's own step of a pose, with a correction that was taken before: the same to the last bit."""
+    velocity, turning = body.velocity, body.angular_velocity
+    body.velocity = velocity.x + correction.x, velocity.y + correction.y
+    body.angular_velocity = turning + correction.turning
+    pymunk.Body.update_position(body, dt)
+    body.velocity, body.angular_velocity = velocity, turning

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-import difflib
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple
 
+from tlf_env.common.errors import nearest, shown
 from tlf_env.disturbances.channels import CHANNELS
 from tlf_env.task.reward import REWARD_MEANINGS
 
@@ -99,7 +99,7 @@ def chosen_keys(infos: InfoChoice) -> tuple[str, ...]:
     if isinstance(infos, bool):
         return INFO_KEYS if infos else ()
     if isinstance(infos, str) or not isinstance(infos, Sequence):
-        raise ValueError(f"infos {infos!r:.60} must be True, False or a sequence of keys of info")
+        raise ValueError(f"infos {shown(infos)} must be True, False or a sequence of keys of info")
     for key in infos:
         check_key(key)
     return tuple(dict.fromkeys(infos))
@@ -115,9 +115,8 @@ def check_key(key: str) -> None:
     """
     if key in INFO_KEYS:
         return
-    near = difflib.get_close_matches(str(key), INFO_KEYS, n=1)
-    hint = f"; did you mean {near[0]!r}?" if near else f"; the keys are {', '.join(INFO_KEYS)}"
-    raise ValueError(f"info has no key {key!r:.60}{hint}")
+    hint = nearest(key, INFO_KEYS) or f"; the keys are {', '.join(INFO_KEYS)}"
+    raise ValueError(f"info has no key {shown(key)}{hint}")
 
 
 class State(NamedTuple):

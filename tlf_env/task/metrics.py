@@ -167,7 +167,7 @@ def string_metrics(
     frequency gain is |S_xy|/S_xx (Welch, 20 s segments) at frequencies up to 1 Hz with a coherence of at
     least 0.5. From ``settle_s`` on.
     """
-    from scipy.signal import coherence, csd, welch
+    from scipy.signal import csd, welch
 
     first = round(scenario.settle_s / scenario.control_period_s)
     steps, robots = columns["x_mm"].shape
@@ -187,8 +187,12 @@ def string_metrics(
             "nperseg": min(len(mine), round(SEGMENT_S / scenario.control_period_s)),
         }
         frequency, cross = csd(theirs, mine, **options)
-        power, alike = welch(theirs, **options)[1], coherence(theirs, mine, **options)[1]
-        usable = (power > 0) & (alike >= MIN_COHERENCE)
+        power, own_power = welch(theirs, **options)[1], welch(mine, **options)[1]
+        moving = (power > 0) & (own_power > 0)
+        # |S_xy|²/(S_xx S_yy); 0 where one of them does not move
+        coherence = np.divide(np.abs(cross) ** 2, power, out=np.zeros_like(power), where=moving)
+        np.divide(coherence, own_power, out=coherence, where=moving)
+        usable = moving & (coherence >= MIN_COHERENCE)
         usable &= (frequency > 0) & (frequency <= MAX_FREQUENCY_HZ)
         if usable.any():
             gain = np.abs(cross[usable]) / power[usable]

@@ -12,16 +12,23 @@ from typing import Annotated, Any, Literal, NoReturn, Self
 from pydantic import (
     AfterValidator,
     Field,
-    FiniteFloat,
     ValidationError,
     field_validator,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
 
-from tlf_env.common.errors import one_line
+from tlf_env.common.errors import nearest, one_line, shown
 from tlf_env.common.files import FILE_NAME
-from tlf_env.common.models import Frozen, NonNegative, Positive, no_switch
+from tlf_env.common.models import (
+    Frozen,
+    NonNegative,
+    Number,
+    Positive,
+    Switch,
+    Whole,
+    is_number,
+)
 from tlf_env.common.presets import is_file_name, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.onboard.controllers import controller
@@ -46,6 +53,17 @@ SETTLE_FRACTION = 0.4
 START_MARGIN_MM = 1.0  # smallest distance between outlines at the start
 DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
+# Names that other libraries use, and what to use here.
+_LENGTH = "use horizon_s, the length of an episode in s"
+_COUNT = "use robots"
+_PERIOD = "use control_period_s, the time between two actions in s"
+OTHER_NAMES = {
+    **dict.fromkeys(("max_cycles", "max_steps", "max_episode_steps", "episode_length"), _LENGTH),
+    **dict.fromkeys(("N", "n", "num_agents", "n_agents", "num_robots", "n_robots"), _COUNT),
+    **dict.fromkeys(("frameskip", "frame_skip", "time_step", "timestep"), _PERIOD),
+    "dt": "use control_period_s or physics_period_s",
+    "seed": "reset() takes the seed",
+}
 NOT_IN_NAMES = re.compile(r"^[^\w]+|[^\w.+-]")
 
 EndCondition = Literal["lost", "touched"]
@@ -92,7 +110,7 @@ class Scenario(Frozen):
     name: str = "custom"
     trajectory: Trajectory
     robots: (
-        Annotated[int, Field(ge=1, le=MAX_ROBOTS)]
+        Annotated[Whole, Field(ge=1, le=MAX_ROBOTS)]
         | Annotated[tuple[RobotParameters, ...], Field(min_length=1, max_length=MAX_ROBOTS)]
     ) = 3  # number of robots, or the parameters of each that differ from `robot`
     robot: RobotParameters = RobotParameters()
@@ -111,7 +129,7 @@ class Scenario(Frozen):
     observer: ObserverParameters | PartPath = ObserverParameters()
 
     disturbance: Disturbance = Disturbance()
-    adversary: bool = False  # whether a caller may set disturbance channels at every step
+    adversary: Switch = False  # whether a caller may set disturbance channels at every step
 
     action: ActionKind = "twist"
     # Base controller of the action `residual`, which is added to its twist: a preset or a file.
@@ -123,10 +141,8 @@ class Scenario(Frozen):
     observation: Literal["tracking", "sensor"] = "tracking"
     dtype: Literal["float32", "float64"] = "float32"  # of observations and actions
     preview_s: tuple[NonNegative, ...] = DEFAULT_PREVIEW_S
-    reward: dict[str, FiniteFloat] = Field(
-        default_factory=lambda: FrozenDict(DEFAULT_WEIGHTS._asdict())
-    )
-    cooperative: bool = False  # every robot receives the formation's mean reward
+    reward: dict[str, Number] = Field(default_factory=lambda: FrozenDict(DEFAULT_WEIGHTS._asdict()))
+    cooperative: Switch = False  # every robot receives the formation's mean reward
     end_on: tuple[EndCondition, ...] = ("lost", "touched")
     lost_beyond_mm: Positive = 1200.0
 
@@ -156,11 +172,6 @@ class Scenario(Frozen):
                 f"got {value!r}"
             )
         return value
-
-    @field_validator("robots", mode="before")
-    @classmethod
-    def _how_many(cls, value: Any) -> Any:
-        return no_switch(value)
 
     @field_validator("disturbance", mode="before")
     @classmethod
@@ -325,8 +336,32 @@ def load_scenario(
 
     Raises
     ------
+    TypeError
+        for a keyword that is no field of a scenario; in one line that names it.
     ValueError
-        in one line with the value and what is allowed.
+        for an unknown key in a file or a mapping, and an invalid value; in one line with the key's path,
+        the value and what is allowed.
+    """
+    for name in overrides:
+        if name not in Scenario.model_fields:
+            names = [*Scenario.model_fields, "disturbance_level"]
+            raise TypeError(
+                f"unexpected keyword argument {name!r}{nearest(name, names, OTHER_NAMES)}"
+            )
+    return scenario_with(source, overrides, disturbance_level)
+
+
+def scenario_with(
+    source: str | Path | Mapping[str, Any] | Scenario,
+    fields: Mapping[str, Any],
+    disturbance_level: float | None = None,
+) -> Scenario:
+    """A scenario as :func:`load_scenario`, its fields from a mapping, for example from a file.
+
+    Raises
+    ------
+    ValueError
+        as :func:`load_scenario`; for an unknown key in ``fields``, too.
     """
     folder = Path()
     if isinstance(source, Scenario):
@@ -334,9 +369,9 @@ def load_scenario(
     elif isinstance(source, Mapping):
         data = dict(source)
     else:
-        data = _read_source(source, overrides.get("control_period_s"))
+        data = _read_source(source, fields.get("control_period_s"))
         folder = Path(source).parent
-    for key, value in overrides.items():
+    for key, value in fields.items():
         if value is not None:
             data[key] = _merged(data.get(key), value)
     if disturbance_level is not None:
@@ -344,21 +379,23 @@ def load_scenario(
     try:
         return Scenario.model_validate(data, context={"folder": folder})
     except ValidationError as error:
-        raise ValueError(one_line(error)) from error
+        raise ValueError(one_line(error, Scenario, OTHER_NAMES)) from error
 
 
-def _read_source(source: str | Path, control_period_s: float | None) -> dict[str, Any]:
-    text = str(source)
+def _read_source(source: str | Path, control_period_s: Any) -> dict[str, Any]:
     if not isinstance(source, str | Path):
         raise ValueError(
-            f"scenario {text!r:.60} must be a preset's name, a file, a mapping or a Scenario"
+            f"scenario {shown(source)} must be a preset's name, a file, a mapping or a Scenario"
         )
     path = Path(source)
-    if path.suffix == ".csv":
-        found = scenario_of_waypoints(path, control_period_s or DEFAULT_CONTROL_PERIOD_S)
+    if path.suffix.lower() == ".csv":
+        given = is_number(control_period_s) and 0 < control_period_s < math.inf
+        found = scenario_of_waypoints(
+            path, float(control_period_s) if given else DEFAULT_CONTROL_PERIOD_S
+        )
         return {**found, "name": name_of(path)}
     found = read_preset_or_file("scenario", source, ", nor a .csv file of waypoints")
-    return {"name": name_of(path) if is_file_name(source) else text, **found}
+    return {"name": name_of(path) if is_file_name(source) else str(source), **found}
 
 
 def name_of(path: Path) -> str:
@@ -449,11 +486,6 @@ def _with_level(disturbance: Any, level: float) -> dict[str, Any]:
         disturbance = _disturbance_preset(disturbance)
     elif isinstance(disturbance, Disturbance):
         disturbance = disturbance.model_dump()
-    if (
-        isinstance(level, bool)
-        or not isinstance(level, int | float)
-        or not math.isfinite(level)
-        or level < 0
-    ):
-        raise ValueError(f"disturbance_level {level!r} must be a finite number, at least 0")
-    return {**disturbance, "level": level}
+    if not is_number(level) or not 0 <= level < math.inf:
+        raise ValueError(f"disturbance_level {shown(level)} must be a finite number, at least 0")
+    return {**disturbance, "level": float(level)}

@@ -7,9 +7,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tlf_env.common.errors import shown
 from tlf_env.onboard.parts import real_numbers
+from tlf_env.task.waypoints import MAX_COORDINATE_MM
 
-START_POSE_LIMIT_MM = 1e10
+START_POSE_LIMIT_MM = MAX_COORDINATE_MM
 OPTIONS = ("poses", "phase_s")
 
 
@@ -104,5 +106,4 @@ def _described(value: Any) -> str:
     """A value in one short line, with its shape if it has one."""
     numbers = real_numbers(value)
     shape = f"the shape {numbers.shape}: " if numbers is not None and numbers.ndim else ""
-    text = " ".join(repr(value).split())
-    return shape + (text if len(text) <= 200 else f"{text[:200]}...")
+    return shape + shown(value)

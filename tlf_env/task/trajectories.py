@@ -13,10 +13,17 @@ from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple, Self
 
 import numpy as np
-from pydantic import Field, FiniteFloat, ValidationInfo, field_validator, model_validator
+from pydantic import Field, ValidationInfo, field_validator, model_validator
 
-from tlf_env.common.models import Frozen, NonNegative, Positive
-from tlf_env.task.waypoints import MAX_MAGNITUDE, Point, checked_points, drive_through, read_points
+from tlf_env.common.models import Frozen, NonNegative, Number, Positive
+from tlf_env.task.waypoints import (
+    MAX_COORDINATE_MM,
+    MAX_MAGNITUDE,
+    Point,
+    checked_points,
+    drive_through,
+    read_points,
+)
 
 REFERENCE_COLUMNS = ("x_mm", "y_mm", "theta_rad", "u_1_mm_s", "u_2_rad_s")
 
@@ -27,7 +34,8 @@ NEARBY_S = 1e-5  # time before such an instant at which the heading is evaluated
 MAX_RATE_RAD_S = 1e4
 SHORTEST_RAMP_S = 1e-6
 
-Coordinate = Annotated[FiniteFloat, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]  # mm, or rad
+Coordinate = Annotated[Number, Field(ge=-MAX_COORDINATE_MM, le=MAX_COORDINATE_MM)]  # mm
+Phase = Annotated[Number, Field(ge=-MAX_MAGNITUDE, le=MAX_MAGNITUDE)]  # rad
 Size = Annotated[Positive, Field(le=MAX_MAGNITUDE)]  # mm, mm/s, s
 Rate = Annotated[Positive, Field(le=MAX_RATE_RAD_S)]
 
@@ -117,8 +125,8 @@ class Lissajous(_Harmonic):
     amplitude_y_mm: Size
     rate_x_rad_s: Rate
     rate_y_rad_s: Rate
-    phase_x_rad: Coordinate = 0.0
-    phase_y_rad: Coordinate = 0.0
+    phase_x_rad: Phase = 0.0
+    phase_y_rad: Phase = 0.0
 
     def sinusoids(self) -> tuple[list[Sinusoid], list[Sinusoid]]:
         """One term per axis."""
@@ -168,7 +176,7 @@ class Circle(_Harmonic):
     period_s: Size | None = None
     speed_mm_s: Size | None = None
     direction: Literal["counterclockwise", "clockwise"] = "counterclockwise"
-    phase_rad: Coordinate = 0.0  # φ: angle of the start, from +x
+    phase_rad: Phase = 0.0  # φ: angle of the start, from +x
 
     @model_validator(mode="after")
     def _check(self) -> Self:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import sys
 from collections.abc import Callable, Sequence
 from functools import lru_cache
 from pathlib import Path
@@ -16,22 +17,31 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tlf_env.common.errors import shown
+from tlf_env.common.models import is_number
 from tlf_env.task.actions import FULL_SPEED_MM_S
 
 HEADER = ("t_s", "x_mm", "y_mm")
 MAX_POINTS = 100_000
 MAX_MAGNITUDE = 1e9  # s, mm
+MAX_COORDINATE_MM = 1e10  # of a place: room for every coordinate of the UTM grid
+COMMENT = "#"  # np.savetxt begins its header with it
 DEFAULT_ROBOTS = 3
 FEW_POINTS = 4  # up to this number free ends are natural: not-a-knot would overshoot
 REST_SHARE = 0.25  # a free end is at rest if slower than this share of its chord's speed
 HELD_MM = 1.0  # within this distance of a rest the heading is constant: its direction is rounding
 SEARCH_PARTS = 64  # of an interval, in the search for that distance
 
+# Times are checked after the first is subtracted: a log may count seconds since 1970.
+LARGEST = {"t_s": sys.float_info.max, "x_mm": MAX_COORDINATE_MM, "y_mm": MAX_COORDINATE_MM}
+
 Point = tuple[float, float, float]
 
 
 def read_points(path: Path) -> tuple[Point, ...]:
     """The waypoints in a CSV file with the header ``t_s,x_mm,y_mm``; the first time becomes 0.
+
+    Lines that begin with ``#`` are comments. The header may be one, as ``np.savetxt`` writes it.
 
     Raises
     ------
@@ -49,15 +59,32 @@ def read_points(path: Path) -> tuple[Point, ...]:
     rows: list[list[str]] = []
     try:
         for row in reader:
-            if any(cell.strip() for cell in row):
+            cells = [cell.strip() for cell in row]
+            if not rows and cells and cells[0].startswith(COMMENT):  # a header or a comment
+                cells[0] = cells[0].lstrip(COMMENT).strip()
+                if tuple(cells) != HEADER:
+                    continue
+            if any(cells) and not cells[0].startswith(COMMENT):
                 lines.append(reader.line_num)
-                rows.append([cell.strip() for cell in row])
+                rows.append(cells)
     except csv.Error as error:
         raise ValueError(f"{path}, line {reader.line_num}: not CSV: {error}") from error
     if not rows or tuple(rows[0]) != HEADER:
         found = repr(",".join(rows[0]))[:60] if rows else "an empty file"
         raise ValueError(f"{path}, line 1: the header must be {','.join(HEADER)}, got {found}")
-    return checked_points(rows[1:], str(path), lambda index: f"{path}, line {lines[index + 1]}")
+    return checked_points(
+        [[_parsed(cell) for cell in row] for row in rows[1:]],
+        str(path),
+        lambda index: f"{path}, line {lines[index + 1]}",
+    )
+
+
+def _parsed(cell: str) -> float | str:
+    """The number in a cell; the cell itself if there is none."""
+    try:
+        return float(cell)
+    except ValueError:
+        return cell
 
 
 def checked_points(
@@ -78,6 +105,11 @@ def checked_points(
     raw = [_numbers(row, place(i)) for i, row in enumerate(rows)]
     points = [(t - raw[0][0], x, y) for t, x, y in raw]
     for i in range(1, len(points)):
+        if not points[i][0] <= MAX_MAGNITUDE:
+            raise ValueError(
+                f"{place(i)}: t_s {raw[i][0]:.17g} must be at most {MAX_MAGNITUDE:g} s after the first "
+                f"time, {raw[0][0]:.17g}"
+            )
         duration_s = points[i][0] - points[i - 1][0]
         if duration_s <= 0:
             raise ValueError(
@@ -103,15 +135,12 @@ def _numbers(row: Any, place: str) -> Point:
         raise ValueError(f"{place}: must be {len(HEADER)} numbers, {','.join(HEADER)}, got {got}")
     values = []
     for name, cell in zip(HEADER, row, strict=True):
-        try:
-            value = math.nan if isinstance(cell, bool) else float(cell)
-        except (TypeError, ValueError):
-            value = math.nan
-        if not abs(value) <= MAX_MAGNITUDE:
+        largest = LARGEST[name]
+        if not is_number(cell) or not abs(cell) <= largest:
             raise ValueError(
-                f"{place}: {name} must be a number within ±{MAX_MAGNITUDE:g}, got {cell!r:.60}"
+                f"{place}: {name} must be a number within ±{largest:g}, got {shown(cell)}"
             )
-        values.append(value)
+        values.append(float(cell))
     return values[0], values[1], values[2]
 
 
