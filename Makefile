@@ -47,7 +47,7 @@ check-lowest: ## Run the tests with the lowest versions that pyproject.toml allo
 	"$$uv" venv -q --python "$(PYTHON)" "$$VIRTUAL_ENV"; \
 	"$$uv" pip install -q "torch==$(TORCH)"; \
 	"$$uv" pip install -q --resolution lowest-direct \
-		-e ".[figures,view,train,tune,bench,peers,ray,dev]"; \
+		-e ".[figures,view,train,tune,bench,peers,ray,benchmarl,dev]"; \
 	"$$uv" pip check; \
 	"$$VIRTUAL_ENV/bin/python" -m pytest $(TESTS)
 
@@ -87,7 +87,7 @@ constraints: ## Update constraints.txt from a temporary environment with every e
 	$(PYTHON) -m venv "$$tmp/venv"; \
 	py="$$tmp/venv/bin/python"; \
 	"$$py" -m pip install -q --disable-pip-version-check "torch==$(TORCH)" \
-		build editables hatchling ".[figures,view,train,tune,bench,peers,ray,dev]"; \
+		build editables hatchling ".[figures,view,train,tune,bench,peers,ray,benchmarl,dev]"; \
 	"$$py" -m pip check; \
 	echo "# Versions of everything that the extras install. Made by: make constraints" > "$$tmp/new"; \
 	"$$py" -m pip freeze --all --exclude pip --exclude tlf-env > "$$tmp/frozen"; \

@@ -78,13 +78,14 @@ WRAPPERS: dict[str, Callable[[Any, Any], Any]] = {
 def test_wrappers_of_supersuit_run_past_an_end(wrapper: str, ending: dict[str, Any]) -> None:
     supersuit = needed("supersuit")
     env = WRAPPERS[wrapper](supersuit, tlf_env.parallel_env("infinity", **ending))
+    env.reset(seed=0)
     ended = 0
     for _ in range(60):
+        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
         if not env.agents:
             ended += 1
             seen, _ = env.reset(seed=ended)
             assert all(env.observation_space(agent).contains(row) for agent, row in seen.items())
-        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
     assert ended >= 2
 
 
