@@ -86,6 +86,16 @@ def run(
         float | None, typer.Option(help="Control period of the policy, s.")
     ] = None,
     horizon_s: Annotated[float | None, typer.Option(help="Length of the run, s.")] = None,
+    phase_s: Annotated[
+        float | None,
+        typer.Option(help="Time on its trajectory at which the leader's reference starts, s."),
+    ] = None,
+    poses: Annotated[
+        str | None,
+        typer.Option(
+            help="Start poses of the robots, x_mm,y_mm,theta_rad of each, with ; between."
+        ),
+    ] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; default results/SCENARIO.")
     ] = None,
@@ -106,6 +116,7 @@ def run(
     from baselines.tables import metrics_table
     from tlf_env.numerics.philox import checked_seed
     from tlf_env.task.scenario import load_scenario, scenario_notes
+    from tlf_env.task.start import start_options
 
     chosen = load_scenario(
         scenario,
@@ -120,6 +131,10 @@ def run(
         horizon_s=horizon_s,
     )
     checked_seed(seed)
+    options: dict[str, Any] = {} if phase_s is None else {"phase_s": phase_s}
+    if poses is not None:
+        options["poses"] = start_poses(poses)
+    start_options(options, chosen.robot_count)
     name = named_policy(policy, gains)
     driver, chosen, overrides = fit_policy(name, chosen, trust=trust)
     if overrides:
@@ -131,7 +146,7 @@ def run(
     folder = writable_folder(out or Path("results") / chosen.name)
     warn_of_compiling()
     with progress_bar(f"{chosen.name}, {name}") as update:
-        record = run_policy(chosen, driver, seed, name=name, progress=update)
+        record = run_policy(chosen, driver, seed, name=name, options=options, progress=update)
     written = write_record(record, folder)
     if mat:
         written.append(write_mat(record, folder))
@@ -142,6 +157,22 @@ def run(
         return
     screen.print(metrics_table(record))
     screen.print(f"In {folder}: {', '.join(path.name for path in written)}", soft_wrap=True)
+
+
+def start_poses(text: str) -> list[list[float]]:
+    """Start poses from ``x_mm,y_mm,theta_rad`` of each robot, with ``;`` between.
+
+    Raises
+    ------
+    ValueError
+        for a text that is not numbers.
+    """
+    try:
+        return [[float(number) for number in row.split(",")] for row in text.split(";")]
+    except ValueError as error:
+        raise ValueError(
+            f"--poses {text!r} must be x_mm,y_mm,theta_rad of each robot, with ; between"
+        ) from error
 
 
 def named_policy(policy: str, gains: str | None) -> str:

@@ -61,6 +61,8 @@ class FormationVecEnv(VecEnv):
 
     Raises
     ------
+    TypeError
+        in one line, for an unknown keyword.
     ValueError
         for a scenario that cannot run in a batch, tasks with different spaces, or too few formations.
     """

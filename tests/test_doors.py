@@ -9,6 +9,7 @@ the parallel environment: those of the reference, and of the learner ``robot_1``
 from __future__ import annotations
 
 import functools
+import json
 from typing import Any, NamedTuple
 
 import gymnasium
@@ -16,7 +17,7 @@ import numpy as np
 import pytest
 
 import tlf_env
-from baselines import ReferencePolicy
+from baselines import ReferencePolicy, cli
 from baselines.runs.run import RECORDED, run_policy
 from tlf_env.task.info import INFO_KEYS
 
@@ -287,3 +288,51 @@ def test_the_recorded_columns(case):
         for name in known:
             wanted = [info[name] for info in step.infos]
             assert np.array_equal(record[name][k], wanted), (k, name)
+
+
+@pytest.mark.parametrize(
+    "given", [[], ["--phase-s", "7.3", "--poses", "0,0,0.1; 0,-300,0; 50,-650,-0.2"]]
+)
+def test_the_command_line(given, tmp_path, monkeypatch):
+    """The reference, recorded by ``tlf run`` and driven by hand in the parallel environment."""
+    command = ["run", "infinity", "--disturbance", "combined-hard", "--seed", str(SEED)]
+    command += ["--horizon-s", "10", "--no-figures", "--out", str(tmp_path), *given]
+    monkeypatch.setattr("sys.argv", ["tlf", *command])
+    cli.main()
+    options = {"phase_s": 7.3, "poses": POSES} if given else None
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert summary["reset_options"] == options
+    env = tlf_env.parallel_env("infinity", disturbance="combined-hard", horizon_s=10.0, end_on=())
+    policy = ReferencePolicy("consistent")
+    observations, infos = env.reset(seed=SEED, options=options)
+    steps = [infos]
+    while env.agents:
+        actions, _ = policy.predict(rows(observations))
+        observations, *_, infos = env.step(dict(zip(env.agents, actions, strict=True)))
+        steps.append(infos)
+    with np.load(tmp_path / "trajectory.npz") as columns:
+        known = [name for name in columns.files if name in INFO_KEYS]
+        assert len(known) > 15
+        for name in known:
+            wanted = [[info[name] for info in infos.values()] for infos in steps]
+            assert np.array_equal(columns[name], wanted), name
+
+
+@pytest.mark.parametrize(
+    ("given", "says"),
+    [
+        (["--poses", "0,0"], "poses must be 3 finite rows"),
+        (["--poses", "a,b,c"], "--poses 'a,b,c' must be x_mm,y_mm,theta_rad of each robot"),
+        (["--phase-s", "nan"], "phase_s must be a finite number of seconds, got nan"),
+    ],
+)
+def test_an_impossible_option_of_the_command_line_is_named(
+    given, says, tmp_path, monkeypatch, capsys
+):
+    command = ["run", "infinity", "--out", str(tmp_path / "out"), *given]
+    monkeypatch.setattr("sys.argv", ["tlf", *command])
+    with pytest.raises(SystemExit) as stop:
+        cli.main()
+    assert stop.value.code == 2
+    assert says in " ".join(capsys.readouterr().err.split())
+    assert not (tmp_path / "out").exists()

@@ -356,6 +356,34 @@ def test_numpys_numbers_make_the_same_scenario():
     assert numpys.model_dump_json() == plain.model_dump_json()
 
 
+@pytest.mark.parametrize("value", [np.array(3.0), "3", True, None, [1.0]])
+def test_a_channel_that_is_no_number_and_no_signal_says_what_is_wanted(value):
+    with pytest.raises(
+        ValueError, match=r"slip\.delta_1_mm_s: Input should be a number or a signal"
+    ):
+        load_scenario("infinity", disturbance={"slip": {"delta_1_mm_s": value}})
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        (
+            {"disturbance": {"slip": {"delta_1_mm_s": {}}}},
+            "delta_1_mm_s: the key 'type' is missing",
+        ),
+        ({"trajectory": {"radius_mm": 3.0}}, "trajectory: the key 'type' is missing"),
+        ({"trajectory": 3}, "trajectory: Input should be a mapping, got 3"),
+        ({"wheel_loop": 3}, "wheel_loop: Input should be a mapping, or a text, got 3"),
+        ({"robots": "3"}, "robots: Input should be a whole number, or a list, got '3'"),
+        ({"name": 3}, "name: Input should be a text, got 3"),
+    ],
+)
+def test_what_is_wanted_is_said_in_words_of_the_files(fields, said):
+    data = {**load_scenario("circle").model_dump(), **fields}
+    with pytest.raises(ValueError, match=re.escape(said)):
+        load_scenario(data)
+
+
 class Unprintable:
     """An object that cannot be printed."""
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 import types
 from collections.abc import Iterable, Mapping, Sequence
 from typing import (
@@ -18,6 +19,10 @@ from pydantic import BaseModel, ValidationError
 
 LENGTH_ERRORS = ("too_short", "too_long")
 ALLOWED = "Input should be "
+PLAINLY = {"dictionary": "mapping", "tuple": "list", "string": "text"}
+PYDANTICS = re.compile(
+    r"valid (dictionary|tuple|string)(?: or (?:instance of \w+|object to extract fields from))?"
+)
 MOST_ERRORS = 6  # named in a line
 FEW_NAMES = 8  # so many allowed names are all listed
 SHOWN = 60  # characters of a value, and of a key
@@ -82,7 +87,7 @@ def one_line(error: ValidationError, kind: Any, hints: Mapping[str, str] | None 
     found = [_placed(kind, item) for item in error.errors(include_url=False)]
     merged: dict[Any, tuple[_Found, str]] = {}
     for number, one in enumerate(_relevant(found)):
-        message = one.item["msg"]
+        message = PYDANTICS.sub(lambda match: PLAINLY[match[1]], one.item["msg"])
         same = (one.keys, repr(one.item["input"]))
         if not message.startswith(ALLOWED):
             merged[number] = one, message
@@ -215,6 +220,8 @@ def _message(one: _Found, message: str, hints: Mapping[str, str]) -> str:
     if one.item["type"] == "extra_forbidden":
         others = hints if len(one.keys) == 1 else {}
         message = f"unknown key{nearest(one.keys[-1], one.allowed, others)}"
+    elif one.item["type"] == "union_tag_not_found":
+        message = f"the key {one.item['ctx']['discriminator']} is missing"
     elif one.item["type"] != "value_error" and not isinstance(value, dict | list):
         message += f", got {shown(value)}"
     return f"{location}: {message}" if location else message

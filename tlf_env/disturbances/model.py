@@ -7,10 +7,12 @@ Nominal is the paper's: noise of the position fixes of 0.2 mm² variance and not
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
-from pydantic import BeforeValidator, model_validator
+from pydantic import BaseModel, BeforeValidator, model_validator
+from pydantic_core import PydanticCustomError
 
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive, is_number
 from tlf_env.disturbances.channels import CHANNELS, PATHS, SUBSTEP, number, numbers
@@ -22,6 +24,8 @@ from tlf_env.physics.vehicle import Body, Motion
 def _plain_number(value: Any) -> Any:
     if is_number(value):
         return {"type": "constant", "value": value}
+    if not isinstance(value, Mapping | BaseModel):
+        raise PydanticCustomError("signal_type", "Input should be a number or a signal, a mapping")
     return value
 
 

@@ -54,6 +54,8 @@ class BatchPlant:
 
     Raises
     ------
+    TypeError
+        in one line, for an unknown keyword.
     ValueError
         for a scenario that cannot run in a batch (user-defined parts, ``adversary``), scenarios that
         differ elsewhere, or a number out of range; naming the field.

@@ -67,6 +67,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
 
     Raises
     ------
+    TypeError
+        in one line, for an unknown keyword.
     ValueError
         in one line, for an unknown key or an invalid value.
     """

@@ -61,6 +61,8 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Raises
     ------
+    TypeError
+        in one line, for an unknown keyword.
     ValueError
         in one line, for an unknown learner, key or value.
     """

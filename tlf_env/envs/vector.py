@@ -64,6 +64,8 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
 
     Raises
     ------
+    TypeError
+        in one line, for an unknown keyword.
     ValueError
         in one line, for an unknown learner, mode, key or value.
     """

@@ -140,6 +140,7 @@ class PymunkPlant:
         self._space.step(dt)
         for body in self._space.bodies:
             body.position_func = pymunk.Body.update_position
+            body._position_func = None  # pymunk before 7.3.1 keeps the last one, and copies it
         self._corrections = []
 
     def __getstate__(self) -> dict[str, Any]:
