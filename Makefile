@@ -2,6 +2,7 @@
 
 PYTHON ?= python3
 TORCH ?= 2.13.0
+TESTS ?= tests
 
 VENV := .venv
 BIN := $(VENV)/bin
@@ -9,7 +10,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow test-learning check format board speed speed-docs constraints clean
+.PHONY: help run test test-slow test-learning check check-lowest check-clients format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -34,6 +35,35 @@ check: $(VENV)/.stamp-test ## Lint, check format and types
 	$(BIN)/lint-imports --no-cache
 	$(BIN)/codespell
 
+# pip cannot choose the lowest versions, uv can; but it does not read pip's setting of folders of wheels.
+# torch comes first, so that a build of the fixed version in such a folder is taken.
+check-lowest: ## Run the tests with the lowest versions that pyproject.toml allows, in a temporary environment
+	@set -e; \
+	tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \
+	$(PYTHON) -m venv "$$tmp/tools"; \
+	"$$tmp/tools/bin/python" -m pip install -q --disable-pip-version-check uv; \
+	uv="$$tmp/tools/bin/uv"; \
+	export UV_FIND_LINKS="$${PIP_FIND_LINKS-}" VIRTUAL_ENV="$$tmp/venv"; \
+	"$$uv" venv -q --python "$(PYTHON)" "$$VIRTUAL_ENV"; \
+	"$$uv" pip install -q "torch==$(TORCH)"; \
+	"$$uv" pip install -q --resolution lowest-direct \
+		-e ".[figures,view,train,tune,bench,peers,ray,benchmarl,dev]"; \
+	"$$uv" pip check; \
+	"$$VIRTUAL_ENV/bin/python" -m pytest $(TESTS)
+
+# Their requirements exclude each other. CLIENT names the library whose absence is an error, not a skipped test.
+check-clients: ## Run the tests with other libraries, each of CLIENTS in a temporary environment
+	@set -e; \
+	for client in $(CLIENTS); do \
+		echo "== $$client"; \
+		tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \
+		$(PYTHON) -m venv "$$tmp"; \
+		"$$tmp/bin/python" -m pip install -q --disable-pip-version-check -e . \
+			"torch==$(TORCH)" pytest -r "tests/clients/$$client.txt"; \
+		CLIENT=$$client "$$tmp/bin/python" -m pytest -rs tests/test_clients.py; \
+		rm -rf "$$tmp"; \
+	done
+
 format: $(VENV)/.stamp-test ## Sort the imports and format the sources
 	$(BIN)/ruff check --select I --fix
 	$(BIN)/ruff format
@@ -57,7 +87,7 @@ constraints: ## Update constraints.txt from a temporary environment with every e
 	$(PYTHON) -m venv "$$tmp/venv"; \
 	py="$$tmp/venv/bin/python"; \
 	"$$py" -m pip install -q --disable-pip-version-check "torch==$(TORCH)" \
-		build editables hatchling ".[figures,view,train,tune,bench,peers,ray,dev]"; \
+		build editables hatchling ".[figures,view,train,tune,bench,peers,ray,benchmarl,dev]"; \
 	"$$py" -m pip check; \
 	echo "# Versions of everything that the extras install. Made by: make constraints" > "$$tmp/new"; \
 	"$$py" -m pip freeze --all --exclude pip --exclude tlf-env > "$$tmp/frozen"; \

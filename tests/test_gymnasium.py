@@ -6,6 +6,8 @@ import hashlib
 import itertools
 import multiprocessing
 import pickle
+import subprocess
+import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from typing import Any
@@ -41,6 +43,9 @@ AGENTS = ("robot_0", "robot_1", "robot_2")
 
 every_kind = pytest.mark.parametrize(("action", "observation", "plant"), KINDS)
 no_warnings = pytest.mark.filterwarnings("error")
+pettingzoo_ids = pytest.mark.skipif(
+    not hasattr(pettingzoo, "register"), reason="PettingZoo has ids from 1.27 on"
+)
 
 
 class Idle:
@@ -156,12 +161,26 @@ def test_gymnasium_makes_the_tasks_by_id(task: str, robots: int) -> None:
 
 
 @pytest.mark.parametrize("task", ["infinity", "flower"])
+@pettingzoo_ids
 def test_pettingzoo_makes_the_tasks_by_id(task: str) -> None:
     env = pettingzoo.make("parallel", f"tlf_env/{task}-v0", robots=2)
     assert set(env.reset(seed=0)[0]) == {"robot_0", "robot_1"}
     turns = pettingzoo.make("aec", f"tlf_env/{task}-v0", robots=2)
     turns.reset(seed=0)
     assert turns.agent_selection == "robot_0"
+
+
+def test_without_ids_of_pettingzoo_the_package_still_has_its_doors() -> None:
+    code = (
+        "import pettingzoo\n"
+        "vars(pettingzoo).pop('register', None)\n"
+        "import gymnasium, tlf_env\n"
+        "assert 'tlf_env/Infinity-v0' in gymnasium.registry\n"
+        "assert tlf_env.parallel_env('infinity').possible_agents[0] == 'robot_0'\n"
+        "assert tlf_env.aec_env('infinity').possible_agents[0] == 'robot_0'\n"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr
 
 
 def test_a_spec_survives_json() -> None:

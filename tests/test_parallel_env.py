@@ -112,10 +112,39 @@ def test_parallel_seeds(scenario):
     parallel_seed_test(lambda: tlf_env.parallel_env(scenario), num_cycles=300)
 
 
+@pytest.mark.skipif(not hasattr(pettingzoo, "register"), reason="PettingZoo has ids from 1.27 on")
 def test_registered_names():
     env = pettingzoo.make("parallel", "tlf_env/flower-v0", robots=2)
     assert env.scenario.name == "flower"
     assert env.possible_agents == ["robot_0", "robot_1"]
+
+
+# Random numbers for wrappers
+
+
+def test_np_random_follows_the_seed_of_the_reset():
+    def draws(env: tlf_env.envs.parallel.FormationParallelEnv) -> list[float]:
+        return env.np_random.random(3).tolist()
+
+    env = make()
+    assert draws(env) != draws(env)
+    env.reset(seed=5)
+    first = draws(env)
+    env.reset()
+    assert draws(env) != first
+    env.reset(seed=5)
+    assert draws(env) == first
+
+
+def test_drawing_from_np_random_changes_no_episode():
+    plain, drawn = make(), make()
+    for env in (plain, drawn):
+        env.reset(seed=5)
+    drawn.np_random.random(100)
+    action = dict.fromkeys(plain.agents, np.zeros(2))
+    for _ in range(5):
+        seen, others = plain.step(action)[0], drawn.step(action)[0]
+        assert all(np.array_equal(seen[agent], others[agent]) for agent in seen)
 
 
 # Spaces

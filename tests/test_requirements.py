@@ -7,6 +7,7 @@ import tomllib
 from pathlib import Path
 
 import pytest
+import yaml
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
@@ -25,6 +26,20 @@ PINS = {
 @pytest.mark.parametrize("requirement", REQUIREMENTS, ids=str)
 def test_every_requirement_is_fixed_at_a_version_within_its_bound(requirement: Requirement) -> None:
     assert PINS[canonicalize_name(requirement.name)] in requirement.specifier
+
+
+def test_the_workflow_runs_every_check() -> None:
+    """The jobs of a public forge: each target for tests in the Makefile, and each file of clients."""
+    jobs = yaml.safe_load((ROOT / ".github/workflows/checks.yml").read_text(encoding="utf-8"))[
+        "jobs"
+    ]
+    run = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
+    targets = {command.split()[1] for command in run}
+    assert targets == {"test", "test-learning", "check-lowest", "check-clients"}
+    makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
+    assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
+    clients = sorted(path.stem for path in (ROOT / "tests" / "clients").glob("*.txt"))
+    assert jobs["clients"]["strategy"]["matrix"]["client"] == clients
 
 
 def test_the_extra_view_makes_videos_too() -> None:

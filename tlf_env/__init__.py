@@ -47,16 +47,17 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_MODULES[name]), name)
 
 
+_PETTINGZOO_HAS_IDS = hasattr(pettingzoo, "register")  # from 1.27 on
+
 for _task in ("infinity", "flower"):
-    pettingzoo.register(
-        "parallel",
-        f"tlf_env/{_task}-v0",
-        "tlf_env.envs.parallel:parallel_env",
-        kwargs={"scenario": _task},
-    )
-    pettingzoo.register(
-        "aec", f"tlf_env/{_task}-v0", "tlf_env.envs.parallel:aec_env", kwargs={"scenario": _task}
-    )
+    if _PETTINGZOO_HAS_IDS:
+        for _kind in ("parallel", "aec"):
+            pettingzoo.register(
+                _kind,
+                f"tlf_env/{_task}-v0",
+                f"tlf_env.envs.parallel:{_kind}_env",
+                kwargs={"scenario": _task},
+            )
     gymnasium.register(
         f"tlf_env/{_task.capitalize()}-v0",
         "tlf_env.envs.single:FormationEnv",

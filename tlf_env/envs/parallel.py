@@ -10,6 +10,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 import pymunk
+from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
@@ -123,7 +124,15 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self._adversary = adversary
         self._renderer: Any = None
         self._seed: int | None = None
+        self._np_random: np.random.Generator | None = None
         self._episode = 0
+
+    @property
+    def np_random(self) -> np.random.Generator:
+        """Random numbers for wrappers, seeded by :meth:`reset`; the environment draws none from it."""
+        if self._np_random is None:
+            self._np_random, _ = seeding.np_random(self._seed)
+        return self._np_random
 
     @property
     def scenario(self) -> Scenario:
@@ -175,6 +184,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         start = start_options(given, self.scenario.robot_count)
         if seed is not None:
             self._seed, self._episode = checked_seed(seed), 0
+            self._np_random = None
         elif self._seed is None:
             self._seed, self._episode = secrets.randbelow(MAX_SEED), 0
         else:

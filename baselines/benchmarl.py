@@ -1,0 +1,109 @@
+"""Tasks for BenchMARL, which trains them with any of its algorithms for continuous actions.
+
+>>> from baselines.benchmarl import FormationTask
+>>> task = FormationTask.INFINITY.get_from_yaml()
+>>> task.config["horizon_s"] = 20.0
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from benchmarl.environments import Task, TaskClass
+from torchrl.data import Composite
+from torchrl.envs import EnvBase, PettingZooWrapper
+
+from tlf_env.common.presets import presets_folder
+from tlf_env.envs.parallel import parallel_env
+
+
+class FormationTaskClass(TaskClass):
+    """A formation as BenchMARL sees it: one group, ``robot``, and the true state for central critics.
+
+    ``config`` holds the arguments of :func:`tlf_env.parallel_env`. An invalid one is an error as there, when
+    the environment is made.
+    """
+
+    def get_env_fun(
+        self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
+    ) -> Callable[[], EnvBase]:
+        """A function that makes one environment; BenchMARL itself makes ``num_envs`` of them."""
+        arguments = dict(self.config)
+        return lambda: PettingZooWrapper(
+            parallel_env(**arguments), return_state=True, seed=seed, device=device
+        )
+
+    def supports_continuous_actions(self) -> bool:
+        """True: the actions are numbers from -1 to 1."""
+        return True
+
+    def supports_discrete_actions(self) -> bool:
+        """False."""
+        return False
+
+    def has_render(self, env: EnvBase) -> bool:
+        """Whether ``config`` asks for frames."""
+        return self.config.get("render_mode") == "rgb_array"
+
+    def max_steps(self, env: EnvBase) -> int:
+        """Control steps of an episode at most."""
+        return parallel_env(**self.config).scenario.horizon_steps
+
+    def group_map(self, env: EnvBase) -> dict[str, list[str]]:
+        """All robots in one group."""
+        return env.group_map
+
+    def observation_spec(self, env: EnvBase) -> Composite:
+        """The observations of the robots, as ``("robot", "observation")``."""
+        return _entries(env, "observation")
+
+    def info_spec(self, env: EnvBase) -> Composite | None:
+        """The infos of the robots, as ``("robot", "info")``; None if ``config`` leaves them out."""
+        return _entries(env, "info") or None
+
+    def state_spec(self, env: EnvBase) -> Composite | None:
+        """The true state of the formation, as ``"state"``."""
+        return Composite({"state": env.observation_spec["state"].clone()})
+
+    def action_spec(self, env: EnvBase) -> Composite:
+        """The actions of the robots, as ``("robot", "action")``."""
+        return env.full_action_spec
+
+    def action_mask_spec(self, env: EnvBase) -> Composite | None:
+        """None: every action is allowed at any time."""
+        return None
+
+    @staticmethod
+    def env_name() -> str:
+        """The name of the environment in BenchMARL's logs."""
+        return "tlf_env"
+
+
+class FormationTask(Task):
+    """The tasks: the presets in ``configs/benchmarl``."""
+
+    INFINITY = None
+    FLOWER = None
+
+    @staticmethod
+    def associated_class() -> type[TaskClass]:
+        """The class of the tasks."""
+        return FormationTaskClass
+
+    def get_from_yaml(self, path: str | None = None) -> TaskClass:
+        """The task with the arguments in a YAML file; the shipped one if ``path`` is None."""
+        shipped = presets_folder() / "benchmarl" / f"{self.name.lower()}.yaml"
+        return super().get_from_yaml(str(path or shipped))
+
+
+def _entries(env: EnvBase, key: str) -> Composite:
+    """The observation specs of one key, by group."""
+    specs = env.observation_spec
+    return Composite(
+        {
+            group: Composite({key: specs[group, key].clone()}, shape=specs[group].shape)
+            for group in env.group_map
+            if key in specs[group].keys()  # noqa: SIM118 - `in` asks whether a tensor fits the spec
+        }
+    )

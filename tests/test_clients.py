@@ -1,0 +1,421 @@
+"""Libraries that drive the environment: wrappers, learners, and what the page about them shows.
+
+A test is skipped where its library is missing. ``make check-clients`` installs the libraries, in an
+environment for each file in tests/clients, and sets ``CLIENT`` to the file whose libraries must be there.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import os
+import re
+import warnings
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+import pytest
+import yaml
+
+import tlf_env
+from tlf_env.common.presets import presets_folder
+from tlf_env.task.info import INFO_KEYS
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGE = (ROOT / "docs" / "compatibility.md").read_text(encoding="utf-8")
+BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
+
+
+def pins(client: str) -> dict[str, str]:
+    """The versions in a file of tests/clients, by the name of the module."""
+    text = (ROOT / "tests" / "clients" / f"{client}.txt").read_text(encoding="utf-8")
+    lines = re.findall(r"^([\w-]+)(?:\[\w+\])?==(\S+)$", text, re.MULTILINE)
+    return {name.replace("-", "_"): version for name, version in lines}
+
+
+CLIENTS = {path.stem: pins(path.stem) for path in (ROOT / "tests" / "clients").glob("*.txt")}
+REQUIRED = CLIENTS[os.environ["CLIENT"]] if "CLIENT" in os.environ else {}
+
+BRIEF: dict[str, Any] = {
+    "disturbance": "none",
+    "horizon_s": 0.4,
+    "time_gap_s": 0.2,
+    "preview_s": (),
+}
+LOST = {**BRIEF, "horizon_s": 4.0, "lost_beyond_mm": 30.0}  # ends early by a lost robot
+
+both_ends = pytest.mark.parametrize("ending", [BRIEF, LOST], ids=["horizon", "lost"])
+pytestmark = pytest.mark.filterwarnings("ignore")  # of the libraries, about each other
+
+
+def needed(name: str) -> Any:
+    """The module ``name``; without it the test is skipped, unless it is one of the required."""
+    if name.split(".")[0] in REQUIRED:
+        return importlib.import_module(name)
+    return pytest.importorskip(name)
+
+
+# SuperSuit
+
+WRAPPERS: dict[str, Callable[[Any, Any], Any]] = {
+    "frame_skip": lambda supersuit, env: supersuit.frame_skip_v0(env, 3),
+    "frame_stack": lambda supersuit, env: supersuit.frame_stack_v1(env, 4),
+    "normalize_obs": lambda supersuit, env: supersuit.normalize_obs_v0(env),
+    "clip_actions": lambda supersuit, env: supersuit.clip_actions_v0(env),
+    "agent_indicator": lambda supersuit, env: supersuit.agent_indicator_v0(env, type_only=False),
+    "black_death": lambda supersuit, env: supersuit.black_death_v3(env),
+    "dtype": lambda supersuit, env: supersuit.dtype_v0(env, np.float64),
+    "delay_observations": lambda supersuit, env: supersuit.delay_observations_v0(env, 3),
+    "sticky_actions": lambda supersuit, env: supersuit.sticky_actions_v0(env, 0.3),
+}
+
+
+@pytest.mark.parametrize("wrapper", WRAPPERS)
+@both_ends
+def test_wrappers_of_supersuit_run_past_an_end(wrapper: str, ending: dict[str, Any]) -> None:
+    supersuit = needed("supersuit")
+    env = WRAPPERS[wrapper](supersuit, tlf_env.parallel_env("infinity", **ending))
+    env.reset(seed=0)
+    ended = 0
+    for _ in range(60):
+        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+        if not env.agents:
+            ended += 1
+            seen, _ = env.reset(seed=ended)
+            assert all(env.observation_space(agent).contains(row) for agent, row in seen.items())
+    assert ended >= 2
+
+
+def test_a_skipped_frame_is_a_step_with_the_same_action() -> None:
+    supersuit = needed("supersuit")
+    plain = tlf_env.parallel_env("infinity", **BRIEF)
+    skipping = supersuit.frame_skip_v0(tlf_env.parallel_env("infinity", **BRIEF), 3)
+    plain.reset(seed=3)
+    skipping.reset(seed=3)
+    actions = {agent: np.full(2, 0.3, np.float32) for agent in plain.agents}
+    rewards = [plain.step(actions)[1] for _ in range(3)]
+    _, total, *_ = skipping.step(actions)
+    for agent in actions:
+        assert total[agent] == pytest.approx(sum(step[agent] for step in rewards))
+
+
+# Gymnasium's conversion to tensors
+
+
+def test_a_single_environment_gives_tensors() -> None:
+    torch = needed("torch")
+    needed("array_api_compat")
+    from gymnasium.wrappers import NumpyToTorch
+
+    env = NumpyToTorch(gymnasium.make("tlf_env/Infinity-v0", **BRIEF))
+    env.reset(seed=0)
+    over = False
+    while not over:
+        seen, _, terminated, truncated, info = env.step(torch.zeros(2))
+        over = terminated or truncated
+    assert isinstance(seen, torch.Tensor)
+    assert {key: int(info[key]) for key in ("lost", "touched", "end")} == {
+        "lost": 0,
+        "touched": 0,
+        "end": int(tlf_env.EndReason.HORIZON),
+    }
+
+
+@pytest.mark.parametrize("mode", ["sync", "vector_entry_point"])
+def test_a_vector_environment_gives_tensors(mode: str) -> None:
+    torch = needed("torch")
+    needed("array_api_compat")
+    from gymnasium.wrappers.vector import NumpyToTorch
+
+    env = NumpyToTorch(
+        gymnasium.make_vec("tlf_env/Infinity-v0", num_envs=3, vectorization_mode=mode, **BRIEF)
+    )
+    env.reset(seed=0)
+    ends = []
+    for _ in range(30):
+        seen, rewards, _, _, info = env.step(torch.zeros(3, 2))
+        ends += info["end"].tolist()
+    assert isinstance(seen, torch.Tensor)
+    assert isinstance(rewards, torch.Tensor)
+    assert ends.count(int(tlf_env.EndReason.HORIZON)) == 3
+
+
+# TorchRL
+
+every_choice_of_infos = pytest.mark.parametrize(
+    "infos", [True, False, ("position_error_mm", "end")], ids=["all", "none", "two"]
+)
+
+
+@every_choice_of_infos
+@both_ends
+def test_torchrl_drives_the_parallel_environment(infos: Any, ending: dict[str, Any]) -> None:
+    envs = needed("torchrl.envs")
+    from torchrl.envs.utils import check_env_specs
+
+    env = envs.PettingZooWrapper(
+        tlf_env.parallel_env("infinity", infos=infos, **ending), return_state=True
+    )
+    check_env_specs(env)
+    rollout = env.rollout(60, break_when_any_done=False)["next"]
+    robots = rollout["robot"]
+    over = rollout["done"].flatten()
+    assert over.sum() >= 2
+    lost = "lost_beyond_mm" in ending
+    assert robots["terminated"][over].any(dim=1).all() == lost
+    assert (robots["terminated"] ^ robots["truncated"])[over].all()
+    assert rollout["state"].isfinite().all()
+    keys = set(INFO_KEYS) if infos is True else set(infos or ())
+    assert set(robots.get("info", {}).keys()) == keys
+    if "end" in keys:
+        assert (robots["info", "end"][over] > 0).all()
+        assert (robots["info", "end"][~over] == 0).all()
+
+
+def test_torchrl_drives_the_turn_based_environment() -> None:
+    envs = needed("torchrl.envs")
+    from torchrl.envs.utils import check_env_specs
+
+    env = envs.PettingZooWrapper(tlf_env.aec_env("infinity", **BRIEF), use_mask=True)
+    check_env_specs(env)
+    assert env.rollout(150, break_when_any_done=False)["next", "done"].sum() == 2
+
+
+@pytest.mark.parametrize("maker", ["GymEnv", "GymWrapper"])
+@both_ends
+def test_torchrl_drives_the_single_environment(maker: str, ending: dict[str, Any]) -> None:
+    envs = needed("torchrl.envs")
+    from torchrl.envs.utils import check_env_specs
+
+    if maker == "GymEnv":
+        env = envs.GymEnv("tlf_env/Infinity-v0", **ending)
+    else:
+        env = envs.GymWrapper(gymnasium.make("tlf_env/Infinity-v0", **ending))
+    check_env_specs(env)
+    over = env.rollout(60, break_when_any_done=False)["next", "done"]
+    assert over.sum() >= 2
+
+
+# BenchMARL
+
+
+@pytest.mark.parametrize("algorithm", ["Ippo", "Mappo"])
+@pytest.mark.parametrize("task", ["INFINITY", "FLOWER"])
+def test_benchmarl_trains_a_task(algorithm: str, task: str, tmp_path: Path) -> None:
+    algorithms = needed("benchmarl.algorithms")
+    from benchmarl.experiment import Experiment, ExperimentConfig
+    from benchmarl.models import MlpConfig
+
+    from baselines.benchmarl import FormationTask
+
+    chosen = FormationTask[task].get_from_yaml()
+    chosen.config.update(horizon_s=1.0, time_gap_s=0.5, preview_s=())
+    config = ExperimentConfig.get_from_yaml()
+    config.save_folder, config.loggers, config.render = str(tmp_path), ["csv"], False
+    config.max_n_iters, config.max_n_frames = 2, None
+    config.on_policy_collected_frames_per_batch = config.evaluation_interval = 200
+    config.on_policy_n_envs_per_worker, config.evaluation_episodes = 2, 1
+    config.on_policy_minibatch_size, config.on_policy_n_minibatch_iters = 100, 1
+    experiment = Experiment(
+        task=chosen,
+        algorithm_config=getattr(algorithms, f"{algorithm}Config").get_from_yaml(),
+        model_config=MlpConfig.get_from_yaml(),
+        critic_model_config=MlpConfig.get_from_yaml(),
+        seed=0,
+        config=config,
+    )
+    before = _numbers(experiment)
+    experiment.run()
+    assert experiment.n_iters_performed == 2
+    assert np.isfinite(experiment.mean_return)
+    assert (_numbers(experiment) != before).any()
+    logged = {path.name for path in tmp_path.rglob("*.csv")}
+    assert {f"collection_robot_info_{key}.csv" for key in ("position_error_mm", "lost")} <= logged
+
+
+def _numbers(experiment: Any) -> np.ndarray:
+    parameters = experiment.losses["robot"].parameters()
+    return np.concatenate([part.detach().numpy().ravel().copy() for part in parameters])
+
+
+@pytest.mark.parametrize(
+    "path",
+    sorted((presets_folder() / "benchmarl").glob("*.yaml")),
+    ids=lambda path: path.stem,
+)
+def test_the_shipped_tasks_are_arguments_of_the_environment(path: Path) -> None:
+    arguments = yaml.safe_load(path.read_text(encoding="utf-8"))
+    env = tlf_env.parallel_env(**arguments)
+    assert env.scenario.name == path.stem
+    assert list(env.reset(seed=0)[1]["robot_0"]) == arguments["infos"]
+
+
+# Tianshou
+
+
+def test_tianshou_trains_by_ppo(capsys: pytest.CaptureFixture[str]) -> None:
+    needed("tianshou")
+    shown = next(block for block in BLOCKS if "tianshou" in block)
+    result = _run(shown)["result"]
+    assert result.update_step > 0
+    assert np.isfinite(result.best_reward)
+
+
+def test_tianshou_drives_the_turn_based_environment() -> None:
+    needed("tianshou")
+    from tianshou.env.pettingzoo_env import PettingZooEnv
+
+    env = PettingZooEnv(tlf_env.aec_env("infinity", **BRIEF))
+    seen, _ = env.reset(seed=0)
+    turns, over = 0, False
+    while not over:
+        seen, rewards, terminated, truncated, _ = env.step(np.zeros(2, np.float32))
+        turns, over = turns + 1, terminated or truncated
+    assert turns == 3 * 20
+    assert np.isfinite(rewards).all()
+    assert np.isfinite(seen["obs"]).all()
+
+
+# AgileRL
+
+
+def _brief_env() -> Any:
+    return tlf_env.parallel_env("infinity", **BRIEF)
+
+
+@pytest.fixture
+def crowd() -> Iterator[Any]:
+    """Two environments in processes of their own, by AgileRL."""
+    vector = needed("agilerl.vector")
+    env = vector.AsyncPettingZooVecEnv([_brief_env] * 2)
+    yield env
+    env.close()
+
+
+def test_agilerl_steps_environments_in_processes(crowd: Any) -> None:
+    alone = _brief_env()
+    crowd.reset(seed=0)
+    alone.reset(seed=0)
+    for _ in range(10):
+        seen, rewards, *_ = crowd.step({agent: np.zeros((2, 2)) for agent in crowd.agents})
+        expected, paid, *_ = alone.step({agent: np.zeros(2) for agent in alone.agents})
+        for agent in alone.agents:
+            np.testing.assert_array_equal(seen[agent][0], expected[agent])
+            assert rewards[agent][0] == pytest.approx(paid[agent])
+    for _ in range(40):  # past an end
+        seen, *_ = crowd.step({agent: np.zeros((2, 2)) for agent in crowd.agents})
+    assert all(np.isfinite(rows).all() for rows in seen.values())
+
+
+def test_agilerl_trains_by_ippo(crowd: Any) -> None:
+    needed("agilerl")
+    from agilerl.algorithms import IPPO
+    from agilerl.training.train_multi_agent_on_policy import train_multi_agent_on_policy
+
+    learner = IPPO(
+        [crowd.single_observation_space(agent) for agent in crowd.agents],
+        [crowd.single_action_space(agent) for agent in crowd.agents],
+        agent_ids=list(crowd.agents),
+        learn_step=32,
+        batch_size=16,
+        update_epochs=1,
+    )
+    _, fitness = train_multi_agent_on_policy(
+        crowd,
+        "infinity",
+        "IPPO",
+        [learner],
+        max_steps=64,
+        evo_steps=64,
+        eval_steps=8,
+        verbose=False,
+    )
+    assert np.isfinite(fitness).all()
+
+
+# RLlib
+
+
+@both_ends
+def test_rllib_samples_whole_episodes(ending: dict[str, Any]) -> None:
+    needed("ray.rllib")
+    from ray.rllib.algorithms.ppo import PPOConfig
+    from ray.rllib.env.multi_agent_env_runner import MultiAgentEnvRunner
+    from ray.rllib.env.wrappers.pettingzoo_env import ParallelPettingZooEnv
+    from ray.tune.registry import register_env
+
+    register_env(
+        "brief", lambda _: ParallelPettingZooEnv(tlf_env.parallel_env("infinity", **ending))
+    )
+    config = (
+        PPOConfig()
+        .environment("brief", disable_env_checking=True)
+        .multi_agent(policies={"all"}, policy_mapping_fn=lambda *_, **__: "all")
+        .env_runners(num_env_runners=0)
+    )
+    runner = MultiAgentEnvRunner(config=config)
+    episodes = runner.sample(num_episodes=3, random_actions=True)
+    assert len(episodes) == 3
+    assert all(episode.is_done for episode in episodes)
+    if "lost_beyond_mm" not in ending:
+        assert [len(episode) for episode in episodes] == [20] * 3
+
+
+@pytest.mark.parametrize("runners", [0, 1], ids=["local", "remote"])
+def test_rllib_trains_by_ppo(runners: int) -> None:
+    ray = needed("ray")
+    needed("ray.rllib")
+    from ray.rllib.algorithms.ppo import PPOConfig
+
+    config = (
+        PPOConfig()
+        .environment("tlf_env:tlf_env/Infinity-v0", env_config=BRIEF)
+        .env_runners(num_env_runners=runners, rollout_fragment_length=100)
+        .training(train_batch_size=100, minibatch_size=50, num_epochs=1)
+    )
+    algorithm = config.build_algo()
+    try:
+        sampled = algorithm.train()["env_runners"]
+        assert sampled["num_env_steps_sampled"] == 100
+        assert np.isfinite(sampled["episode_return_mean"])
+    finally:
+        algorithm.stop()
+        ray.shutdown()
+
+
+# The page
+
+
+def _run(block: str) -> dict[str, Any]:
+    """The names that a block of the page makes; skipped where one of its libraries is missing."""
+    tree = ast.parse(block)
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Import):
+            for alias in node.names:
+                needed(alias.name)
+        elif isinstance(node, ast.ImportFrom) and node.module != "baselines.benchmarl":
+            needed(str(node.module))
+    made: dict[str, Any] = {"__name__": "__main__"}
+    exec(compile(block, "docs/compatibility.md", "exec"), made)
+    return made
+
+
+@pytest.mark.parametrize("number", range(len(BLOCKS)))
+def test_what_the_page_shows_runs(
+    number: int, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        assert _run(BLOCKS[number])
+
+
+def test_the_page_has_the_versions_that_are_installed_for_the_check() -> None:
+    rows = re.findall(r"^\| \[([\w-]+)\]\(\S+\) \| (\d[\w.]*) \|", PAGE, re.MULTILINE)
+    shown = {name.lower().replace("rllib", "ray"): version for name, version in rows}
+    for client in CLIENTS:
+        assert shown[client] == CLIENTS[client][client]
+    assert shown["supersuit"] == CLIENTS["torchrl"]["supersuit"]
