@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import os
+import signal
+
 import numpy as np
 import pytest
 
@@ -176,6 +179,21 @@ def test_impossible_options_are_refused_at_once(options, says):
     with pytest.raises(ValueError, match=says) as error:
         environment(2).set_options(options)
     assert "\n" not in str(error.value)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_child_steps_after_two_threads_did():
+    env = environment(64, threads=2)
+    env.seed(0)
+    env.reset()
+    moves = actions(192, 2)
+    env.step(moves[0])
+    child = os.fork()
+    if child == 0:
+        signal.alarm(60)  # a child that hangs ends, and fails the test
+        seen = env.step(moves[1])[0]
+        os._exit(0 if np.isfinite(seen).all() else 1)
+    assert os.waitpid(child, 0)[1] == 0
 
 
 @pytest.mark.parametrize("formations", [2.5, "8", None, float("nan"), True, 0, -1])

@@ -9,6 +9,7 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.wrappers.vector import NormalizeObservation, RecordEpisodeStatistics
 
 import tlf_env
+from tlf_env.envs.vector import FormationVectorEnv
 from tlf_env.task.info import INFO_KEYS
 
 SHORT = {"horizon_s": 5.0, "time_gap_s": 1.0, "preview_s": (0.5,), "plant": "batch"}
@@ -175,8 +176,6 @@ def test_a_returned_observation_is_not_overwritten():
     ],
 )
 def test_what_does_not_exist_is_one_clear_error(change, says):
-    from tlf_env.envs.vector import FormationVectorEnv
-
     with pytest.raises(ValueError, match=says) as error:
         FormationVectorEnv("infinity", 3, **change)
     assert "\n" not in str(error.value)
@@ -310,6 +309,8 @@ def test_a_reset_after_the_end_takes_its_options(mode):
             r"poses must be 3 finite rows .* got the shape \(4, 3, 3\)",
         ),
         ({"poses": np.full((5, 3, 3), np.nan)}, "poses must be 3 finite rows"),
+        ("phase_s", "reset options must be a mapping, got 'phase_s'"),
+        ({"reset_mask": np.ones(4, dtype=bool)}, r"mask must be \(5,\) bool"),
         ({"speed": 1}, "reset option 'speed' is unknown; the options are poses, phase_s"),
     ],
 )
@@ -371,6 +372,12 @@ def test_max_episode_steps_is_gymnasiums_time_limit(steps):
 def test_an_impossible_number_of_steps_is_named(steps):
     with pytest.raises(ValueError, match=f"max_episode_steps {steps!r} must be a whole number"):
         vector(2, max_episode_steps=steps)
+
+
+def test_without_gymnasiums_maker_there_is_no_specification():
+    env = FormationVectorEnv("infinity", 2)
+    assert env.spec is None
+    assert repr(env) == "FormationVectorEnv(num_envs=2)"
 
 
 def test_the_specification_knows_the_episode():

@@ -94,6 +94,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             if steps < self.plant.scenario.horizon_steps:
                 with without_warnings():
                     self.plant = make(horizon_s=steps * self.plant.scenario.control_period_s)
+        self._spec: EnvSpec | None = None
         self._info_keys = chosen_keys(infos)
         self._mask_keys = [f"_{key}" for key in self._info_keys]
         self._info_rows = [INFO_KEYS.index(key) for key in self._info_keys]
@@ -173,8 +174,10 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         ValueError
             for a seed out of its range, a mask of another shape, or an unknown or invalid option.
         """
-        options = dict(options or {})
-        mask = options.pop(RESET_MASK, None)
+        mask = None
+        if isinstance(options, Mapping):
+            mask = options.get(RESET_MASK)
+            options = {key: value for key, value in options.items() if key != RESET_MASK}
         start = start_options(options, self.scenario.robot_count, self.num_envs)
         chosen, given = self.plant.check_reset(seed, mask)
         # With NextStep, the next episode of a formation that ended has started already.
