@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from pathlib import Path
 
 import numpy as np
 import pymunk
@@ -238,3 +239,16 @@ def test_a_users_own_collision_handler_is_called_and_changes_nothing():
     plain = run(None)
     assert same(run(lambda arbiter, space, data: calls.append(arbiter.is_first_contact)), plain)
     assert calls
+
+
+def test_the_documented_example_runs():
+    page = (Path(__file__).parent.parent / "docs" / "environment.md").read_text(encoding="utf-8")
+    section = page.split("## Objects in the space")[1]
+    names: dict = {}
+    exec(section.split("```python\n")[1].split("```")[0], names)
+    env = names["env"]
+    start = names["person"].position
+    for _ in range(10):
+        env.step(dict.fromkeys(env.agents, np.zeros(2)))
+    assert names["person"].position - start == pytest.approx((160.0, 0.0), abs=1e-6)
+    assert names["box"].position == (0.0, 0.0)

@@ -153,8 +153,8 @@ state, for critics.
 
 ## Objects in the space
 
-On the plant `pymunk` (the default), `env.space` is a [pymunk](https://www.pymunk.org) space in mm, s and kg, and
-`env.robot_bodies` the robots' bodies in it. What you add to it takes part:
+On the plant `pymunk` (the default), `env.space` is a [pymunk](https://www.pymunk.org) space in mm, s and kg
+(forces in mN), and `env.robot_bodies` contains the robots' bodies in it. What you add to it takes part:
 
 ```python
 import pymunk
@@ -178,7 +178,7 @@ env.space.add(
 - A dynamic body slides without friction on the floor, unless its `velocity_func` slows it down.
 - `reset` keeps the objects, and puts each body back to where the first step found it. Copies and pickles take
   them along; functions of yours must be picklable for that.
-- A control step takes about ten times as long while an object is near enough to a robot to act on it, and
+- A control step takes about twenty times as long while an object is near enough to a robot to act on it, and
   always with constraints or forces. Objects out of reach change no bit of the robots' motion.
 
 ## Many formations

@@ -162,8 +162,8 @@ class PymunkPlant:
 
     def advance_objects(self, motions: np.ndarray, steps: int, dt: float) -> None:
         """Run so many substeps of the space while the robots stand where they are."""
+        self._write(motions, np.zeros_like(motions))
         for _ in range(steps):
-            self._write(motions, np.zeros_like(motions))
             self._space.step(dt)
 
     def _write(self, poses: np.ndarray, velocities: np.ndarray) -> None:
