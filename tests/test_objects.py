@@ -252,3 +252,18 @@ def test_the_documented_example_runs():
         env.step(dict.fromkeys(env.agents, np.zeros(2)))
     assert names["person"].position - start == pytest.approx((160.0, 0.0), abs=1e-6)
     assert names["box"].position == (0.0, 0.0)
+
+
+@pytest.mark.parametrize("plant", ["batch", "kinematic"])
+def test_a_plant_without_contact_refuses_objects(plant):
+    env = environment(plant=plant)
+    env.reset(seed=0)
+    still = dict.fromkeys(env.agents, np.zeros(2))
+    assert env.space.bodies
+    env.step(still)
+    x, y = env.robot_bodies["robot_0"].position
+    box(env, (x, y + 150.0))
+    before = env.state()
+    with pytest.raises(ValueError, match=f"plant '{plant}' has no contact: .* need plant 'pymunk'"):
+        env.step(still)
+    assert np.array_equal(env.state(), before)

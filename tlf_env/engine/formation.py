@@ -169,11 +169,16 @@ class Formation:
         Raises
         ------
         ValueError
-            for an action that is not finite, naming the robot; then nothing has changed.
+            for an action that is not finite, naming the robot; for objects in the space that could act on
+            a robot, on a plant without contact. Then nothing has changed.
         """
         arrays, settings = self.arrays, self._settings
         motion, period_s = arrays.rows("motion"), settings.period
-        objects = self.plant.objects(motion, period_s) if settings.collides else NO_OBJECTS
+        objects = self.plant.objects(motion, period_s)
+        if objects != NO_OBJECTS and not settings.collides:
+            raise ValueError(
+                f"plant {self.scenario.plant!r} has no contact: objects in the space need plant 'pymunk'"
+            )
         self._left[0] = 0
         by_substep = objects == WITHIN_REACH and not settings.has_parts
         given = settings._replace(has_parts=True) if by_substep else settings
