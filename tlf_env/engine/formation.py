@@ -26,7 +26,12 @@ from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.parts import Factory, real_numbers
-from tlf_env.physics.pymunk_plant import PymunkPlant
+from tlf_env.physics.pymunk_plant import (
+    NO_OBJECTS,
+    OUT_OF_REACH,
+    WITHIN_REACH,
+    PymunkPlant,
+)
 from tlf_env.physics.vehicle import Body
 from tlf_env.task.info import Info
 from tlf_env.task.scenario import Scenario
@@ -164,18 +169,29 @@ class Formation:
         Raises
         ------
         ValueError
-            for an action that is not finite, naming the robot; then nothing has changed.
+            for an action that is not finite, naming the robot; for objects in the space that could act on
+            a robot, on a plant without contact. Then nothing has changed.
         """
         arrays, settings = self.arrays, self._settings
+        motion, period_s = arrays.rows("motion"), settings.period
+        objects = self.plant.objects(motion, period_s)
+        if objects != NO_OBJECTS and not settings.collides:
+            raise ValueError(
+                f"plant {self.scenario.plant!r} has no contact: objects in the space need plant 'pymunk'"
+            )
         self._left[0] = 0
-        result = drivers.control_step(arrays, self._left, self._nothing, settings)
+        by_substep = objects == WITHIN_REACH and not settings.has_parts
+        given = settings._replace(has_parts=True) if by_substep else settings
+        result = drivers.control_step(arrays, self._left, self._nothing, given)
+        if objects == OUT_OF_REACH and result in (drivers.DONE, drivers.MUST_SUBSTEP):
+            self.plant.advance_objects(motion, settings.substeps, settings.dt)
         if result == drivers.DONE:
             return
         if result >= 0:
             raise ValueError(
                 f"robot_{result}: the action must be finite, got {arrays.actions[0, result].tolist()}"
             )
-        self._substep_by_substep(close=result == drivers.MUST_COLLIDE)
+        self._substep_by_substep(close=result == drivers.MUST_COLLIDE or objects == WITHIN_REACH)
         drivers.transmit(arrays, 0, settings)
         drivers.refer(
             arrays, 0, 0, 1 if settings.external_observer else self.scenario.robot_count, settings
@@ -196,6 +212,9 @@ class Formation:
             if close:
                 self.plant.collide(before, motion, settings.dt)
             drivers.sense(arrays, 0, substep, settings)
+            for robot in self.plant.hit if close else ():
+                if not arrays.touched[0, robot]:
+                    arrays.touched[0, robot] = arrays.touched_now[0, robot] = True
             self._parts.estimate(arrays, substep)
 
     def state(self) -> np.ndarray:

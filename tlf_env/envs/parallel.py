@@ -146,8 +146,18 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
 
     @property
     def space(self) -> pymunk.Space:
-        """The pymunk space, with its bodies at the present poses of the robots."""
+        """The pymunk space, with its bodies at the present poses of the robots; mm, s, kg.
+
+        Shapes, bodies and constraints that you add take part from the next :meth:`step` on, on the plant
+        ``pymunk``. :meth:`reset` keeps them, and puts bodies back to where the first step found them.
+        """
         return self._formation.space
+
+    @property
+    def robot_bodies(self) -> dict[Agent, pymunk.Body]:
+        """The pymunk body of each robot, for constraints and forces; its origin is the centre of mass."""
+        self._formation.space  # noqa: B018 - puts the bodies at their present poses
+        return dict(zip(self.possible_agents, self._formation.plant.bodies, strict=True))
 
     def observation_space(self, agent: Agent) -> gymnasium.spaces.Box:
         """Space of an agent's observations; the same object at every call."""

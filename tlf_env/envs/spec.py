@@ -151,6 +151,36 @@ time on its trajectory at which the leader's reference starts, for that episode 
 +y, and positive turns are counter-clockwise (in ROS REP-103, heading 0 points along +x). `state()` is the true
 state, for critics.
 
+## Objects in the space
+
+On the plant `pymunk` (the default), `env.space` is a [pymunk](https://www.pymunk.org) space in mm, s and kg
+(forces in mN), and `env.robot_bodies` contains the robots' bodies in it. What you add to it takes part:
+
+```python
+import pymunk
+import tlf_env
+
+env = tlf_env.parallel_env("infinity")
+env.reset(seed=0)
+wall = pymunk.Segment(env.space.static_body, (-5000, 3300), (8000, 3300), 5)
+box = pymunk.Body(2.0, pymunk.moment_for_box(2.0, (150, 150)))
+box.position = 0.0, 0.0
+person = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+person.position, person.velocity = (-3000.0, 1000.0), (800.0, 0.0)
+env.space.add(
+    wall, box, pymunk.Poly.create_box(box, (150, 150)), person, pymunk.Circle(person, 200)
+)
+```
+
+- A robot that meets a static or kinematic shape (a wall, a moving obstacle) is `touched`, as by another robot.
+  A dynamic body (a box) can be pushed, and is not counted. The outlines of the robots have no friction.
+- Constraints, such as a rope to a trailer, and forces act on robots, too; the wheels answer one substep later.
+- A dynamic body slides without friction on the floor, unless its `velocity_func` slows it down.
+- `reset` keeps the objects, and puts each body back to where the first step found it. Copies and pickles take
+  them along; functions of yours must be picklable for that.
+- A control step takes about twenty times as long while an object is near enough to a robot to act on it, and
+  always with constraints or forces. Objects out of reach change no bit of the robots' motion.
+
 ## Many formations
 
 The following use the batch plant (`tlf_env.BatchPlant`, [architecture.md](architecture.md#many-formations)).
