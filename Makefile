@@ -3,6 +3,7 @@
 PYTHON ?= python3
 TORCH ?= 2.13.0
 TESTS ?= tests
+CLIENTS ?= $(basename $(notdir $(wildcard tests/clients/*.txt)))
 
 VENV := .venv
 BIN := $(VENV)/bin

@@ -103,7 +103,7 @@ class FormationVecEnv(VecEnv):
             gymnasium.spaces.Box(-OBSERVATION_LIMIT, OBSERVATION_LIMIT, (entries,), dtype.type),
             gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), dtype.type),
         )
-        self._seed: int | None = None if seed is None else checked_seed(seed)
+        self._seed: int | None = None if seed is None else self._checked_seed(seed)
 
     def _spaces_agree(self) -> None:
         first = self.plants[0].scenario
@@ -131,12 +131,17 @@ class FormationVecEnv(VecEnv):
         ValueError
             for a seed that is not a whole number from 0 on.
         """
-        self._seed = secrets.randbelow(2**31) if seed is None else checked_seed(seed)
+        self._seed = secrets.randbelow(2**31) if seed is None else self._checked_seed(seed)
         self._seeds = [
             self._seed + int(self._first[where.plant]) + where.formation
             for where in map(self.place, range(self.num_envs))
         ]
         return self._seeds
+
+    def _checked_seed(self, seed: int) -> int:
+        """The seed of the first formation, where the last one's is in range, too."""
+        checked_seed(checked_seed(seed) + int(self._first[-1]) + self.plants[-1].formations - 1)
+        return int(seed)
 
     def set_options(
         self, options: Sequence[Mapping[str, Any]] | Mapping[str, Any] | None = None

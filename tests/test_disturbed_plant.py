@@ -9,6 +9,7 @@ from disturbance_helpers import FREE, ROBOT, Run, constant, make, run, tree
 
 from tlf_env.physics.parameters import RobotParameters, body, laden
 from tlf_env.task.scenario import START_MARGIN_MM
+from tlf_env.task.start import Start
 
 # --- slip ------------------------------------------------------------------------------------------
 
@@ -103,7 +104,7 @@ def test_a_patch_under_one_wheel_turns_the_robot_as_newton_says():
     half = ROBOT.axle_width_mm / 2
     patch = {"x_mm": -half, "y_mm": 0, "radius_mm": 40, "friction_scale": scale}
     formation = make({"tyre": {"patches": [patch]}}, robots=1, action="torque", robot=FREE)
-    formation.reset(0, poses=pose)
+    formation.reset(0, start=Start(poses=np.reshape(pose, (1, -1, 3)), phases_s=None))
     found = Run(formation, 0.08, constant([torque_Nmm / 15, torque_Nmm / 15]))
     # Left wheel slides: F_l = μ_d s N. Right wheel rolls: τ/R − F_r = (J/R²)(a + h α). Castor rolls.
     # (m + J_c/R_c²) a = F_l + F_r;  (I + m d² + I_s p²/T²) α = h (F_r − F_l), about c
@@ -234,6 +235,6 @@ def test_a_scatter_without_room_is_refused_and_given_poses_are_taken_as_they_are
         make({"start": {"heading_std_rad": 1e-15}}, start_spacing_mm=221.0)
     poses = formation.arrays.rows("start")[:, :, 0].T + np.array([10.0, 20.0, 0.1])
     formation = make("start")
-    formation.reset(0, poses=poses)
+    formation.reset(0, start=Start(poses=poses[None], phases_s=None))
     found = formation.arrays.rows("start")[:, :, 0].T
     assert found == pytest.approx(poses)

@@ -50,7 +50,7 @@ def test_every_script_says_what_it_shows_and_how_to_start_it(
 @pytest.mark.parametrize(
     ("name", "words"),
     [
-        ("quickstart_parallel", ("ended by horizon", "robot_2", "mm off its reference")),
+        ("quickstart_parallel", ("ended by HORIZON", "robot_2", "mm off its reference")),
         ("quickstart_gymnasium", ("reference", "random residual", "ended by")),
         ("custom_estimator", ("ekf", "ComplementaryFilter", "mm RMS")),
         ("custom_wheel_loop", ("AVC", "PI", "mm RMS")),

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import re
+import shutil
+import subprocess
 import tomllib
 from pathlib import Path
 
@@ -45,3 +47,13 @@ def test_the_workflow_runs_every_check() -> None:
 def test_the_extra_view_makes_videos_too() -> None:
     names = {Requirement(line).name for line in EXTRAS["view"]}
     assert {"moviepy", "pygame-ce"} <= names
+
+
+@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+def test_the_check_of_clients_runs_each_of_them():
+    done = subprocess.run(
+        ["make", "-n", "check-clients"], cwd=ROOT, capture_output=True, text=True, check=True
+    )
+    clients = sorted(path.stem for path in (ROOT / "tests" / "clients").glob("*.txt"))
+    assert len(clients) > 3
+    assert f"for client in {' '.join(clients)};" in done.stdout

@@ -52,7 +52,7 @@ def thrown_about(lanes: int, seed: int = 0, **overrides: Any) -> tuple[Arrays, S
     a, s = make_arrays([scenario], table, lanes), make_settings(scenario)
     a.seeds[:] = seed + np.arange(lanes)
     everyone = np.ones(lanes, dtype=np.bool_)
-    drivers.start(a, make_variants([scenario]), everyone, np.zeros((0, 3)), s)
+    drivers.start(a, make_variants([scenario]), everyone, np.zeros((0, 0, 3)), s)
     drivers.look(a, everyone, True, s)
     for lane in range(lanes):
         rng = np.random.default_rng(1000 * seed + lane)

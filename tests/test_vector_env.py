@@ -359,13 +359,71 @@ def test_max_episode_steps_is_gymnasiums_time_limit(steps):
     seen, _ = env.reset(seed=3)
     assert np.array_equal(seen[0], limited.reset(seed=3)[0])
     for k, action in enumerate(actions(3, 12)):
-        seen, _, terminated, truncated, _ = env.step(action)
+        seen, _, terminated, truncated, infos = env.step(action)
         one = limited.step(action[0])
         assert np.array_equal(seen[0], one[0])
         assert (terminated[0], truncated[0]) == one[2:4]
         assert truncated[0] == (k + 1 == horizon)
+        assert infos["end"][0] == (tlf_env.EndReason.HORIZON if k + 1 == horizon else 0)
         if k + 1 == horizon:
             break
+
+
+@pytest.mark.filterwarnings("error")
+def test_a_shortened_horizon_warns_of_nothing_that_lies_beyond_it():
+    sensor = {"observation": "sensor", "horizon_s": 2000.0}
+    with pytest.warns(UserWarning, match="max_episode_steps 20") as caught:
+        gymnasium.make_vec("tlf_env/Infinity-v0", 2, max_episode_steps=20, **sensor)
+    assert [str(one.message) for one in caught] == [
+        "max_episode_steps 20 ends episodes before horizon_s 2000, which is 100000 steps"
+    ]
+    gymnasium.make_vec("tlf_env/Infinity-v0", 2, max_episode_steps=20)
+
+
+def test_the_length_in_a_copied_specification_does_not_hide_a_longer_horizon():
+    says = "max_episode_steps 250 ends episodes before horizon_s 60, which is 3000 steps"
+    with pytest.warns(UserWarning, match=says):
+        gymnasium.make(gymnasium.make("tlf_env/Infinity-v0", **SHORT).spec, horizon_s=60.0)
+    with pytest.warns(UserWarning, match=says):
+        gymnasium.make_vec(vector(2).spec, horizon_s=60.0)
+
+
+def test_a_partial_reset_leaves_the_other_rows():
+    """Also of a formation that has ended, and starts again in the next step."""
+    ends = {"horizon_s": 0.4, "time_gap_s": 0.4, "preview_s": (), "end_on": ()}
+    env, many = vector(3, **ends), single(3, **ends)
+    env.reset(seed=2)
+    many.reset(seed=2)
+    for action in actions(3, 20):
+        last, _, _, truncated, _ = env.step(action)
+        many.step(action)
+    assert truncated.all()
+    mask = np.array([True, False, True])
+    seen, _ = env.reset(options={"reset_mask": mask.copy()})
+    theirs, _ = many.reset(options={"reset_mask": mask.copy()})
+    assert np.array_equal(seen, theirs)
+    assert np.array_equal(seen[1], last[1])
+    for action in actions(3, 10):
+        assert np.array_equal(env.step(action)[0], many.step(action)[0])
+
+
+@pytest.mark.parametrize("seed", [np.array(3), np.int64(3)])
+def test_a_seed_of_numpy_is_a_seed(seed):
+    env, other = vector(2), vector(2)
+    assert np.array_equal(env.reset(seed=seed)[0], other.reset(seed=3)[0])
+
+
+@pytest.mark.parametrize("seed", ["3", b"abc", 2.0, [1.5, 2], True])
+def test_an_impossible_seed_is_named(seed):
+    with pytest.raises(ValueError, match="must be a whole number from 0"):
+        vector(2).reset(seed=seed)
+
+
+def test_the_number_of_formations_has_one_name():
+    with pytest.raises(TypeError, match="unexpected keyword argument 'formations'; use num_envs"):
+        vector(2, formations=3)
+    with pytest.raises(TypeError, match="unexpected keyword argument 'num_envs'; use formations"):
+        tlf_env.BatchPlant("infinity", 2, num_envs=3)
 
 
 @pytest.mark.parametrize("steps", [0, -1, 2.5, True, "7"])

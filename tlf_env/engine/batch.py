@@ -121,8 +121,7 @@ class BatchPlant:
             formation that cannot start; in the last case the formations of the mask have to be reset
             again.
         """
-        chosen = self._checked_mask(mask)
-        given, seeds = self._checked_seeds(seed)
+        chosen, given, seeds = self.check_reset(seed, mask)
         start = (
             options
             if isinstance(options, Start)
@@ -153,23 +152,29 @@ class BatchPlant:
             self.arrays.routes[chosen] = 0
             return
         phases_s = np.where(chosen, start.phases_s, self._phases_s[self.arrays.routes])
+        known = dict(zip(self._phases_s.tolist(), self.arrays.tables, strict=True))
         later = np.unique(phases_s[phases_s != 0.0])
         self._phases_s = np.array([0.0, *later])  # of the tables; the first has none
-        tables = [reference_table(self.scenario, phase_s) for phase_s in self._phases_s]
+        tables = [
+            reference_table(self.scenario, phase_s)
+            if known.get(phase_s) is None
+            else known[phase_s]
+            for phase_s in self._phases_s
+        ]
         self.arrays = self.arrays._replace(tables=np.array(tables))
         self.arrays.routes[:] = np.where(phases_s == 0.0, 0, 1 + np.searchsorted(later, phases_s))
 
     def check_reset(
         self, seed: int | Sequence[int | None] | None, mask: np.ndarray | None
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Which formations a reset would start, and which of all have a seed; both ``(formations,)`` bool.
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which formations a reset would start, which of all have a seed, and the seeds; ``(formations,)``.
 
         Raises
         ------
         ValueError
             for a seed out of its range, or a mask of another shape.
         """
-        return self._checked_mask(mask), self._checked_seeds(seed)[0]
+        return self._checked_mask(mask), *self._checked_seeds(seed)
 
     def restart(self, mask: np.ndarray, start: Start | None = None) -> None:
         """Start the present episode of the formations of the mask, ``(formations,)`` bool, over again.
@@ -382,14 +387,15 @@ class BatchPlant:
             )
         return chosen.copy()
 
-    def _checked_seeds(
-        self, seed: int | Sequence[int | None] | None
-    ) -> tuple[np.ndarray, np.ndarray]:
+    def _checked_seeds(self, seed: Any) -> tuple[np.ndarray, np.ndarray]:
         """Which formations have a seed, ``(formations,)`` bool, and the seeds."""
         everywhere = np.ones(self.formations, dtype=np.bool_)
         if seed is None:
             return ~everywhere, np.zeros(self.formations, dtype=np.int64)
-        if not isinstance(seed, Sequence | np.ndarray):
+        if isinstance(seed, np.ndarray) and seed.ndim == 0:
+            seed = seed.item()
+        several = isinstance(seed, Sequence | np.ndarray) and not isinstance(seed, str | bytes)
+        if not several:
             first = checked_seed(seed)
             checked_seed(first + self.formations - 1)
             return everywhere, first + np.arange(self.formations)

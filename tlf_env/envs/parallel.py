@@ -390,5 +390,9 @@ def aec_env(
     render_mode: str | None = None,
     **overrides: Any,
 ) -> Any:
-    """Make the turn-based (AEC) environment by PettingZoo's conversion."""
+    """Make the turn-based (AEC) environment by PettingZoo's conversion.
+
+    The robots move when the last of them has acted, and only then is a wrong action reported; call ``reset``
+    after that.
+    """
     return parallel_to_aec(parallel_env(scenario, render_mode=render_mode, **overrides))

@@ -199,8 +199,10 @@ single environments.
   `terminal_observation` and `TimeLimit.truncated` indicate where to bootstrap: robots whose episode was
   ended by another robot are truncated. Several tasks with any numbers of robots:
   `FormationVecEnv({"infinity": [...], "flower": "flower"})`.
-- `reset` of all of them takes the options `poses` and `phase_s`, for all formations or one for each; in the
-  `VecEnv`, `set_options` sets them for the next `reset`.
+- `reset` of all of them takes the options `poses` and `phase_s`, for all formations or one for each. In the
+  `VecEnv`, `set_options` sets them for the next `reset`: a mapping for all, or a list with one for each robot.
+- `max_episode_steps` shortens the horizon in `make_vec`. In `gymnasium.make`, Gymnasium's own wrapper cuts the
+  episode, so that `end` is still 0 then; `horizon_s` gives the same with `end`.
 - With a sequence of scenarios and `mixture=True` or shares, every episode draws its scenario (domain
   randomisation).
 """

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -18,16 +17,30 @@ from tlf_env.common.errors import shown
 from tlf_env.engine import judging
 from tlf_env.engine.batch import BatchPlant, checked_count
 from tlf_env.engine.excerpt import END_ROW, REWARD_ROW, Excerpt
-from tlf_env.envs.single import BY_REFERENCE, with_length
+from tlf_env.envs.single import BY_REFERENCE, warn_of_limit, with_length
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE
 from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
-from tlf_env.task.scenario import Scenario
+from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.start import start_options
-from tlf_env.task.warn import without_warnings
 
 RESET_MASK = "reset_mask"
+
+
+def shortened(scenario: Any, max_episode_steps: int, overrides: dict[str, Any]) -> dict[str, float]:
+    """The ``horizon_s`` of at most so many control steps, if it is shorter than the (first) scenario's."""
+    steps = checked_count("max_episode_steps", max_episode_steps)
+    if isinstance(scenario, Sequence) and not isinstance(scenario, str):
+        if not scenario:
+            return {}
+        scenario = scenario[0]
+    first = load_scenario(scenario, **overrides)
+    if steps >= first.horizon_steps:
+        return {}
+    if overrides.get("horizon_s") is not None:
+        warn_of_limit(steps, first)
+    return {"horizon_s": steps * first.control_period_s}
 
 
 class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
@@ -54,7 +67,8 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     autoreset_mode
         ``NextStep`` (Gymnasium's default), ``SameStep`` or ``Disabled``.
     max_episode_steps
-        Shortens the scenario's ``horizon_s`` to so many control steps, if it is longer.
+        Shortens the scenario's ``horizon_s`` to so many control steps, if it is longer. With a warning if
+        ``horizon_s`` is given, too.
     infos
         Whether steps return infos; or a sequence of the keys to return.
     render_mode
@@ -85,15 +99,11 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         infos: InfoChoice = True,
         **overrides: Any,
     ) -> None:
-        make = functools.partial(
-            BatchPlant, scenario, num_envs, threads=threads, mixture=mixture, **overrides
-        )
-        self.plant = make()
+        if "formations" in overrides:
+            raise TypeError("unexpected keyword argument 'formations'; use num_envs")
         if max_episode_steps is not None:
-            steps = checked_count("max_episode_steps", max_episode_steps)
-            if steps < self.plant.scenario.horizon_steps:
-                with without_warnings():
-                    self.plant = make(horizon_s=steps * self.plant.scenario.control_period_s)
+            overrides |= shortened(scenario, max_episode_steps, overrides)
+        self.plant = BatchPlant(scenario, num_envs, threads=threads, mixture=mixture, **overrides)
         self._spec: EnvSpec | None = None
         self._info_keys = chosen_keys(infos)
         self._mask_keys = [f"_{key}" for key in self._info_keys]
@@ -133,6 +143,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self.action_space = batch_space(self.single_action_space, self.num_envs)
         self._actions = np.zeros((self.num_envs, robots, ACTION_SIZE))
         self._over = np.zeros(self.num_envs, dtype=np.bool_)  # ended and not restarted
+        self._last = np.zeros_like(self._actions)  # observations of the last step with an end
 
     @property
     def scenario(self) -> Scenario:
@@ -179,7 +190,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
             mask = options.get(RESET_MASK)
             options = {key: value for key, value in options.items() if key != RESET_MASK}
         start = start_options(options, self.scenario.robot_count, self.num_envs)
-        chosen, given = self.plant.check_reset(seed, mask)
+        chosen, given, seeds = self.plant.check_reset(seed, mask)
         # With NextStep, the next episode of a formation that ended has started already.
         begun = chosen & ~given & self._over
         if self.autoreset_mode is not AutoresetMode.NEXT_STEP:
@@ -187,13 +198,14 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if begun.any():
             self.plant.restart(begun, start)
         self.plant.reset(seed, chosen & ~begun, start)
-        if seed is not None:
-            seeds = seed if isinstance(seed, Sequence | np.ndarray) else [seed]
-            first = next((int(one) for one in seeds if one is not None), None)
-            self._np_random, self._np_random_seed = seeding.np_random(first)
+        if given.any():
+            self._np_random, self._np_random_seed = seeding.np_random(int(seeds[given][0]))
         self._over &= ~chosen
         seen = self.plant.excerpt(self._robot)
         self.plant.write_excerpt(seen)
+        if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._over.any():
+            # They have ended and restart in the next step: until then their last observation is seen.
+            seen.observations[self._over] = self._last[self._over]
         return seen.observations, self._infos(seen, None if mask is None else chosen)
 
     def step(
@@ -238,6 +250,7 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         terminated, truncated = judging.terminated(ends), judging.truncated(ends)
         self._over = terminated | truncated
         if self._over.any() and self.autoreset_mode is not AutoresetMode.DISABLED:
+            self._last = seen.observations.copy()
             self.plant.reset(mask=self._over)
             if self.autoreset_mode is AutoresetMode.SAME_STEP:
                 seen, infos = self._begin_again(seen)

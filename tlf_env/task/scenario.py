@@ -62,6 +62,7 @@ OTHER_NAMES = {
     **dict.fromkeys(("N", "n", "num_agents", "n_agents", "num_robots", "n_robots"), _COUNT),
     **dict.fromkeys(("frameskip", "frame_skip", "time_step", "timestep"), _PERIOD),
     "dt": "use control_period_s or physics_period_s",
+    "num_envs": "use formations",
     "seed": "reset() takes the seed",
 }
 NOT_IN_NAMES = re.compile(r"^[^\w]+|[^\w.+-]")
