@@ -383,8 +383,6 @@ def test_a_shortened_horizon_warns_of_nothing_that_lies_beyond_it():
 def test_the_length_in_a_copied_specification_does_not_hide_a_longer_horizon():
     says = "max_episode_steps 250 ends episodes before horizon_s 60, which is 3000 steps"
     with pytest.warns(UserWarning, match=says):
-        gymnasium.make(gymnasium.make("tlf_env/Infinity-v0", **SHORT).spec, horizon_s=60.0)
-    with pytest.warns(UserWarning, match=says):
         gymnasium.make_vec(vector(2).spec, horizon_s=60.0)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import copy
-import warnings
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -19,30 +18,14 @@ from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE, TWIST
 from tlf_env.task.info import InfoChoice
 from tlf_env.task.scenario import Scenario
-from tlf_env.task.warn import callers_level
 
 BY_REFERENCE = "reference"
-
-
-def warn_of_limit(steps: int, scenario: Scenario) -> None:
-    """Warn that episodes end before the scenario's horizon."""
-    warnings.warn(
-        f"max_episode_steps {steps} ends episodes before horizon_s {scenario.horizon_s:g}, which is "
-        f"{scenario.horizon_steps} steps",
-        UserWarning,
-        stacklevel=callers_level(),
-    )
 
 
 def with_length(spec: EnvSpec | None, scenario: Scenario) -> EnvSpec | None:
     """A copy of Gymnasium's specification whose ``max_episode_steps`` is the scenario's horizon."""
     if spec is None:
         return None
-    limit = spec.max_episode_steps
-    if (
-        limit is not None and limit < scenario.horizon_steps
-    ):  # of a registered or a copied specification
-        warn_of_limit(limit, scenario)
     changed = copy.deepcopy(spec)
     changed.max_episode_steps = scenario.horizon_steps
     return changed

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,13 +18,14 @@ from tlf_env.common.errors import shown
 from tlf_env.engine import judging
 from tlf_env.engine.batch import BatchPlant, checked_count
 from tlf_env.engine.excerpt import END_ROW, REWARD_ROW, Excerpt
-from tlf_env.envs.single import BY_REFERENCE, warn_of_limit, with_length
+from tlf_env.envs.single import BY_REFERENCE, with_length
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE
 from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.start import start_options
+from tlf_env.task.warn import callers_level
 
 RESET_MASK = "reset_mask"
 
@@ -39,7 +41,12 @@ def shortened(scenario: Any, max_episode_steps: int, overrides: dict[str, Any]) 
     if steps >= first.horizon_steps:
         return {}
     if overrides.get("horizon_s") is not None:
-        warn_of_limit(steps, first)
+        warnings.warn(
+            f"max_episode_steps {steps} ends episodes before horizon_s {first.horizon_s:g}, which is "
+            f"{first.horizon_steps} steps",
+            UserWarning,
+            stacklevel=callers_level(),
+        )
     return {"horizon_s": steps * first.control_period_s}
 
 
