@@ -202,8 +202,8 @@ single environments.
 - `reset` of all of them takes the options `poses` and `phase_s`, for all formations or one for each. In the
   `VecEnv`, `set_options` sets them for the next `reset`: a mapping for all, or a list with one for each robot.
 - `max_episode_steps` shortens the horizon in `make_vec`. In `gymnasium.make`, Gymnasium's own wrapper cuts the
-  episode, so that `end` is still 0 then; `horizon_s` gives the same with `end`. `env.spec` contains the length of
-  an episode: to make another environment from it with a longer `horizon_s`, pass `max_episode_steps=-1`.
+  episode, so that `end` is still 0 then; `horizon_s` gives the same with `end`. `env.spec` contains the length
+  of an episode: to make another environment from it with a longer `horizon_s`, pass `max_episode_steps=-1`.
 - With a sequence of scenarios and `mixture=True` or shares, every episode draws its scenario (domain
   randomisation).
 """
