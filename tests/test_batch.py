@@ -305,6 +305,10 @@ def test_scenarios_that_differ_elsewhere_are_refused(change, said):
         ({"threads": 0}, "threads 0"),
         ({"mixture": [0.5, 0.5]}, "mixture"),
         ({"mixture": [-1.0]}, "mixture"),
+        ({"mixture": "a"}, "mixture 'a' must be True or 1 shares"),
+        ({"mixture": [True]}, "mixture .True. must be"),
+        ({"mixture": None}, "mixture None must be"),
+        ({"mixture": np.array([[1.0], [2.0]])}, "mixture array.* must be"),
         ({"estimator": "mine:Filter"}, "estimator 'mine:Filter'"),
         ({"observer": "mine:Observer"}, "observer 'mine:Observer'"),
         ({"wheel_loop": "mine:Loop"}, "wheel_loop 'mine:Loop'"),
@@ -316,6 +320,20 @@ def test_what_cannot_run_in_a_batch_is_told(options, said):
     options = {"formations": 1} | options
     with pytest.raises(ValueError, match=said) as caught:
         BatchPlant("infinity", **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("sources", "said"),
+    [
+        (["infinity", {"Int": 1}], "^scenario 1: .*Int"),
+        (["infinity2", "infinity"], "^scenario 0: .*'infinty'"),
+        (["infinity2"], "^scenario 'infinty'"),
+    ],
+)
+def test_the_scenario_that_cannot_be_loaded_is_numbered(sources, said):
+    with pytest.raises(ValueError, match=said) as caught:
+        BatchPlant(sources, 3)
     assert "\n" not in str(caught.value)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import functools
 import importlib.util
 import os
 import shutil
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import warnings
 from collections.abc import Callable, Iterator
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -196,7 +198,53 @@ def test_without_any_folder_there_is_none(tmp_path, monkeypatch):
     (tmp_path / "file").touch()
     monkeypatch.setenv("TLF_ENV_CACHE", str(tmp_path / "file"))
     monkeypatch.setattr(compiled.tempfile, "gettempdir", no_temporary_folder)
-    assert chosen() is None
+    with pytest.warns(RuntimeWarning, match="no compiled code is kept"):
+        assert chosen() is None
+
+
+@pytest.fixture
+def temporary(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """The system's temporary folder."""
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr(compiled.tempfile, "tempdir", str(tmp_path / "tmp"))
+    return tmp_path / "tmp"
+
+
+def test_a_tilde_of_the_named_folder_is_the_home_folder(tmp_path, monkeypatch):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("USERPROFILE", str(tmp_path))
+    monkeypatch.setenv("TLF_ENV_CACHE", "~/cc")
+    assert chosen() == tmp_path / "cc" / compiled.sources_digest()
+
+
+def test_a_tilde_of_an_unknown_user_warns(tmp_path, monkeypatch, temporary):
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("TLF_ENV_CACHE", "~no-such-user-here/cc")
+    with pytest.warns(RuntimeWarning, match="not used: the user has no home folder"):
+        assert chosen().is_relative_to(temporary)
+
+
+def test_a_named_folder_that_is_not_used_warns_once(tmp_path, monkeypatch, temporary):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("TLF_ENV_CACHE", str(tmp_path / "file"))
+    anew = functools.cache(compiled.cache_folder.__wrapped__)
+    with pytest.warns(RuntimeWarning, match="TLF_ENV_CACHE is not used") as seen:
+        assert anew() == anew()
+    assert len(seen) == 1
+    message = str(seen[0].message)
+    assert "Not a directory" in message or "exists" in message
+    assert str(anew()) in message
+    assert anew().is_relative_to(temporary)
+    assert "\n" not in message
+
+
+def test_a_usual_folder_that_is_not_used_gives_no_warning(tmp_path, monkeypatch, temporary):
+    (tmp_path / "file").touch()
+    monkeypatch.delenv("TLF_ENV_CACHE", raising=False)
+    monkeypatch.setattr(compiled.platformdirs, "user_cache_dir", lambda name: tmp_path / "file")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert chosen().is_relative_to(temporary)
 
 
 def test_a_user_without_a_home_gets_no_folder_named_tilde(tmp_path, monkeypatch):
@@ -230,14 +278,16 @@ def test_a_warm_folder_that_cannot_be_written_is_used(warm):
 
 def test_an_empty_folder_that_cannot_be_written_is_not(warm, tmp_path):
     (warm / "probe.nbi").unlink()
-    assert chosen().is_relative_to(tmp_path / "tmp")
+    with pytest.warns(RuntimeWarning, match="cannot be written, and nothing compiled is in it"):
+        assert chosen().is_relative_to(tmp_path / "tmp")
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs owners of files")
 @pytest.mark.parametrize("mode", [0o775, 0o757, 0o777])
 def test_code_is_not_loaded_from_a_folder_that_others_may_write(warm, tmp_path, mode):
     warm.chmod(mode)
-    assert chosen().is_relative_to(tmp_path / "tmp")
+    with pytest.warns(RuntimeWarning, match="another user owns it or may write in it"):
+        assert chosen().is_relative_to(tmp_path / "tmp")
 
 
 @pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs owners of files")
@@ -254,7 +304,8 @@ def test_code_is_loaded_from_a_folder_of_the_user_or_root_only(warm, monkeypatch
 
     monkeypatch.setattr(Path, "stat", owned)
     monkeypatch.setattr(compiled.os, "getuid", lambda: me + 7)
-    assert (chosen() == warm) is taken
+    with nullcontext() if taken else pytest.warns(RuntimeWarning, match="another user owns it"):
+        assert (chosen() == warm) is taken
 
 
 def environment(tmp_path: Path) -> dict[str, str]:

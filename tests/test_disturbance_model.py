@@ -3,6 +3,7 @@
 import math
 import re
 
+import numpy as np
 import pytest
 import yaml
 from disturbance_helpers import DOCS, GAP_S, ONE_LINE, SHOWS, environment, rest, run, tree
@@ -75,6 +76,12 @@ def test_an_adversary_does_what_the_channel_does(path):
         ({"radio.dropout": [0.1, 0.2, 1.5]}, ["radio.dropout", "1.5", "0 to 0.999"]),
         ({"actuator.computing_delay_s": 0.5}, ["actuator.computing_delay_s", "0.5", "0.02"]),
         ({"slip.delta_1_mm_s": [1.0, 2.0]}, ["slip.delta_1_mm_s", "3"]),
+        ({"slip.delta_1_mm_s": True}, ["slip.delta_1_mm_s", "True"]),
+        ({"slip.delta_1_mm_s": [1.0, True, 2.0]}, ["slip.delta_1_mm_s", "True"]),
+        ({"slip.delta_1_mm_s": np.ones(3, dtype=bool)}, ["slip.delta_1_mm_s", "True"]),
+        (5, ["adversary", "mapping", "got 5"]),
+        (None, ["adversary", "mapping", "got None"]),
+        ([("slip.delta_1_mm_s", 1.0)], ["adversary", "mapping", "got [("]),
     ],
 )
 def test_an_adversarys_impossible_values_are_refused(values, words):

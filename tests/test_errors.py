@@ -28,6 +28,14 @@ from tlf_env.onboard.controllers import ControllerFile, load_controller
 from tlf_env.physics.openloop import OpenLoopScenario
 from tlf_env.task.scenario import OTHER_NAMES, Scenario, load_scenario
 
+
+class Unprintable:
+    """An object that cannot be printed."""
+
+    def __repr__(self) -> str:
+        raise RuntimeError("no")
+
+
 FREE = {"settings", "found", "scores", "training", "versions", "entries", "seeds", "disturbances"}
 
 SIGNALS = (
@@ -384,13 +392,6 @@ def test_what_is_wanted_is_said_in_words_of_the_files(fields, said):
         load_scenario(data)
 
 
-class Unprintable:
-    """An object that cannot be printed."""
-
-    def __repr__(self) -> str:
-        raise RuntimeError("no")
-
-
 @pytest.mark.parametrize(
     "value", [Unprintable(), 10**5000, "x" * 999, "two\nlines"], ids=["bad", "big", "long", "lines"]
 )
@@ -398,3 +399,60 @@ def test_every_value_is_shown_in_one_short_line(value):
     text = shown(value)
     assert 0 < len(text) <= 60
     assert "\n" not in text
+
+
+@pytest.mark.parametrize(
+    "fields", [{"horizon_s": Unprintable()}, {"robots": Unprintable()}, {"dtype": Unprintable()}]
+)
+def test_an_object_that_cannot_be_printed_is_refused_with_its_type(fields):
+    (key,) = fields
+    with pytest.raises(ValueError, match=f"{key}: .*an object of the type Unprintable"):
+        load_scenario("infinity", **fields)
+
+
+@pytest.mark.parametrize(
+    ("fields", "said"),
+    [
+        ({"robots": []}, "robots: must have at least 1 entry, got 0"),
+        ({"robots": [{}] * 1001}, "robots: must have at most 1000 entries, got 1001"),
+        ({"robots": Fraction(10**400, 3)}, "robots: Input should be a whole number"),
+        (
+            {"trajectory": {"type": "circel"}},
+            "trajectory: type must be one of lissajous, rose, circle, waypoints, stop_and_go, "
+            "got 'circel'; did you mean 'circle'?",
+        ),
+        (
+            {"disturbance": {"slip": {"delta_1_mm_s": {"type": "sin"}}}},
+            "got 'sin'; did you mean 'sine'?",
+        ),
+        ({"disturbance": "slipp"}, "did you mean 'slip'?"),
+        ({"reward": {"coars": 1.0}}, "did you mean 'coarse'?"),
+    ],
+)
+def test_a_refusal_has_the_words_of_the_files_and_a_suggestion(fields, said):
+    with pytest.raises(ValueError, match=re.escape(said)):
+        load_scenario("infinity", **fields)
+
+
+def test_a_key_that_is_no_text_is_refused():
+    with pytest.raises(ValueError, match=r"1: keys must be texts, got 1$"):
+        load_scenario({**load_scenario("circle").model_dump(), 1: 2})
+    with pytest.raises(ValueError, match="unknown term 5; the terms are"):
+        load_scenario("infinity", reward={5: 1.0, "x": 1.0})
+
+
+def test_a_misspelt_preset_is_suggested():
+    with pytest.raises(ValueError, match="did you mean 'infinity'"):
+        load_scenario("infinity2")
+
+
+@pytest.mark.parametrize("name", ["threads", "zzz"])
+def test_a_name_far_from_all_others_is_not_suggested(name):
+    assert "did you mean" not in nearest(name, Scenario.model_fields)
+
+
+@pytest.mark.parametrize("source", ["a\nb.yaml", "a\nb.csv", "a\nb"])
+def test_a_path_of_two_lines_is_shown_in_one(source):
+    with pytest.raises(ValueError, match=r"a\\nb") as caught:
+        load_scenario(source)
+    assert "\n" not in str(caught.value)

@@ -356,6 +356,31 @@ def test_a_broken_file_is_refused(tmp_path, text):
     refusal(written(tmp_path, text))
 
 
+ALIASES = "a0: &a0 [1]\n" + "".join(
+    f"a{i}: &a{i} [{', '.join([f'*a{i - 1}'] * 10)}]\n" for i in range(1, 9)
+)
+MERGES = "a0: &a0 {k0: 1}\n" + "".join(
+    f"a{i}: &a{i} {{<<: [{', '.join([f'*a{i - 1}'] * 10)}], k{i}: 1}}\n" for i in range(1, 9)
+)
+
+
+@pytest.mark.parametrize("text", [ALIASES + "robots: *a8\n", ALIASES, MERGES])
+def test_aliases_of_aliases_are_counted(tmp_path, text):
+    message = refusal(written(tmp_path, text))
+    assert "line 7: more than 1000000 values" in message
+
+
+@pytest.mark.parametrize("text", ["a: &a [1, *a]\n", "a: &a {b: {c: *a}}\n"])
+def test_a_value_within_itself_is_refused(tmp_path, text):
+    assert "contains itself" in refusal(written(tmp_path, text))
+
+
+def test_an_alias_may_repeat_a_robot(tmp_path):
+    robots = f"robots: [&r {{mass_kg: 1.2}}{', *r' * 99}]\n"
+    text = f"trajectory: {{type: circle, radius_mm: 90000, speed_mm_s: 100}}\n{robots}"
+    assert load_scenario(written(tmp_path, text)).robot_count == 100
+
+
 @pytest.mark.parametrize("place", ["", "robot:\n  mass_kg: 1.245\n  "])
 def test_a_key_that_stands_twice_is_refused_and_named(tmp_path, place):
     """YAML itself would take the last one in silence."""

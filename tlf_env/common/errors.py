@@ -17,6 +17,7 @@ from typing import (
 
 from pydantic import BaseModel, ValidationError
 
+COMPLETE = ("value_error", "union_tag_invalid", "too_short", "too_long")  # messages with the value
 LENGTH_ERRORS = ("too_short", "too_long")
 ALLOWED = "Input should be "
 PLAINLY = {"dictionary": "mapping", "tuple": "list", "string": "text"}
@@ -24,6 +25,7 @@ PYDANTICS = re.compile(
     r"valid (dictionary|tuple|string)(?: or (?:instance of \w+|object to extract fields from))?"
 )
 MOST_ERRORS = 6  # named in a line
+CLOSENESS = 0.7  # of two names, from 0 to 1, above which one suggests the other
 FEW_NAMES = 8  # so many allowed names are all listed
 SHOWN = 60  # characters of a value, and of a key
 
@@ -41,8 +43,23 @@ def shown(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
+def path_text(path: object) -> str:
+    """A file's path in one line: as it is, unless a character of it cannot be printed."""
+    text = str(path)
+    return text if text.isprintable() else repr(text)
+
+
+def suggestion(name: object, allowed: Iterable[str]) -> str:
+    """What might be meant instead of an unknown name, if one is near: ``"; did you mean 'robots'?"``."""
+    if not isinstance(name, str):
+        return ""
+    lower = {one.lower(): one for one in reversed(list(allowed))}
+    close = difflib.get_close_matches(name.lower()[:SHOWN], list(lower), 1, CLOSENESS)
+    return f"; did you mean {lower[close[0]]!r}?" if close else ""
+
+
 def nearest(name: object, allowed: Iterable[str], others: Mapping[str, str] | None = None) -> str:
-    """What might be meant instead of an unknown name: ``"; did you mean 'robots'?"``, or nothing.
+    """What to say of an unknown name: a :func:`suggestion`, a hint, the names there are, or nothing.
 
     Parameters
     ----------
@@ -55,10 +72,9 @@ def nearest(name: object, allowed: Iterable[str], others: Mapping[str, str] | No
     text = str(name)
     if others and text in others:
         return f"; {others[text]}"
-    lower = {one.lower(): one for one in reversed(names)}
-    close = difflib.get_close_matches(text.lower()[:SHOWN], list(lower), 1)
-    if close:
-        return f"; did you mean {lower[close[0]]!r}?"
+    near = suggestion(text, names)
+    if near:
+        return near
     if 0 < len(names) <= FEW_NAMES:
         return f"; allowed: {', '.join(names)}"
     return ""
@@ -87,8 +103,8 @@ def one_line(error: ValidationError, kind: Any, hints: Mapping[str, str] | None 
     found = [_placed(kind, item) for item in error.errors(include_url=False)]
     merged: dict[Any, tuple[_Found, str]] = {}
     for number, one in enumerate(_relevant(found)):
-        message = PYDANTICS.sub(lambda match: PLAINLY[match[1]], one.item["msg"])
-        same = (one.keys, repr(one.item["input"]))
+        message = _in_own_words(one.item)
+        same = (one.keys, shown(one.item["input"]))
         if not message.startswith(ALLOWED):
             merged[number] = one, message
         elif same in merged:  # another branch of the union
@@ -101,6 +117,31 @@ def one_line(error: ValidationError, kind: Any, hints: Mapping[str, str] | None 
     lines = list(dict.fromkeys(_message(one, text, hints or {}) for one, text in merged.values()))
     more = len(lines) - MOST_ERRORS
     return "; ".join(lines[:MOST_ERRORS]) + (f"; and {more} more errors" if more > 0 else "")
+
+
+def _in_own_words(item: Any) -> str:
+    """Pydantic's message in the words of the files."""
+    more = item.get("ctx", {})
+    match item["type"]:
+        case "too_short":
+            return f"must have at least {_entries(more['min_length'])}, got {more['actual_length']}"
+        case "too_long":
+            got = more["actual_length"]
+            return f"must have at most {_entries(more['max_length'])}, got {got or 'more'}"
+        case "invalid_key":
+            return "keys must be texts"
+        case "union_tag_invalid":
+            kinds = [one.strip().strip("'") for one in more["expected_tags"].split(",")]
+            near = suggestion(more["tag"], kinds)
+            return f"type must be one of {', '.join(kinds)}, got {shown(more['tag'])}{near}"
+        case "union_tag_not_found":
+            return f"the key {more['discriminator']} is missing"
+        case _:
+            return PYDANTICS.sub(lambda match: PLAINLY[match[1]], item["msg"])
+
+
+def _entries(count: int) -> str:
+    return "1 entry" if count == 1 else f"{count} entries"
 
 
 def _placed(kind: Any, item: Any) -> _Found:
@@ -220,8 +261,6 @@ def _message(one: _Found, message: str, hints: Mapping[str, str]) -> str:
     if one.item["type"] == "extra_forbidden":
         others = hints if len(one.keys) == 1 else {}
         message = f"unknown key{nearest(one.keys[-1], one.allowed, others)}"
-    elif one.item["type"] == "union_tag_not_found":
-        message = f"the key {one.item['ctx']['discriminator']} is missing"
-    elif one.item["type"] != "value_error" and not isinstance(value, dict | list):
+    elif one.item["type"] not in COMPLETE and not isinstance(value, dict | list):
         message += f", got {shown(value)}"
     return f"{location}: {message}" if location else message

@@ -11,7 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import IO, Any
 
-from tlf_env.common.errors import RepeatedKeyError
+from tlf_env.common.errors import RepeatedKeyError, path_text
 
 FILE_NAME = re.compile(r"\w[\w.+-]{0,99}")  # a name that can be a file's or a folder's
 
@@ -56,11 +56,13 @@ def read_json(path: Path) -> Any:
     try:
         return parse_json(path.read_text(encoding="utf-8"))
     except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+        raise ValueError(f"cannot read {path_text(path)}: {error.strerror}") from error
     except RepeatedKeyError as error:
-        raise ValueError(f"{path}: {error}") from error
+        raise ValueError(f"{path_text(path)}: {error}") from error
     except ValueError as error:
-        raise ValueError(f"{path} is not JSON: {' '.join(str(error).split())}") from error
+        raise ValueError(
+            f"{path_text(path)} is not JSON: {' '.join(str(error).split())}"
+        ) from error
 
 
 def _without_repeats(pairs: list[tuple[str, Any]]) -> dict[str, Any]:

@@ -16,19 +16,24 @@ def is_number(value: Any) -> bool:
     return isinstance(value, Real) and not isinstance(value, bool)
 
 
-def _number(value: Any) -> float:
-    if not is_number(value):
-        raise PydanticCustomError("number_type", "Input should be a number")
+def as_float(value: Any) -> float:
+    """A number as a float of Python; infinity if it is too large, of either sign."""
     try:
         return float(value)
     except OverflowError:
         return math.inf
 
 
+def _number(value: Any) -> float:
+    if not is_number(value):
+        raise PydanticCustomError("number_type", "Input should be a number")
+    return as_float(value)
+
+
 def _whole_number(value: Any) -> Any:
     if is_number(value) and isinstance(value, Integral):
         return int(value)
-    if is_number(value) and float(value).is_integer():
+    if is_number(value) and as_float(value).is_integer():
         return int(value)
     raise PydanticCustomError("whole_number_type", "Input should be a whole number")
 

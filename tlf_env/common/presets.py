@@ -13,7 +13,7 @@ from typing import Any
 
 import yaml
 
-from tlf_env.common.errors import RepeatedKeyError, shown
+from tlf_env.common.errors import RepeatedKeyError, path_text, shown, suggestion
 
 PACKAGE = Path(__file__).resolve().parent.parent
 KINDS = {
@@ -26,6 +26,10 @@ KINDS = {
 }  # kinds of preset, and the subfolder of each
 SUFFIXES = (".yaml", ".yml")
 MOST_LEVELS = 50  # of mappings and lists in each other
+MOST_VALUES = (
+    1_000_000  # in a file, each as often as aliases repeat it; 100 000 waypoints are 400 000
+)
+DECIMAL = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
 AMBIGUOUS = "!ambiguous"  # tag of the values that YAML 1.1 and 1.2 read differently
 SCALARS = {
@@ -38,8 +42,7 @@ SCALARS = {
     r"|[-+]?[1-9][0-9_]*(?::[0-5]?[0-9])+"  # to the base of 60
     r"|[-+]?[0-9][0-9_]*(?::[0-5]?[0-9])+\.[0-9_]*"
     r"|[0-9]{4}-[0-9][0-9]?-[0-9][0-9]?(?:[Tt \t].*)?",  # a date
-    "tag:yaml.org,2002:float": r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
-    r"|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
+    "tag:yaml.org,2002:float": rf"{DECIMAL}|[-+]?\.(?:inf|Inf|INF)|\.(?:nan|NaN|NAN)",
     "tag:yaml.org,2002:merge": r"<<",
 }  # what plain values mean, the first that fits; all others are texts
 
@@ -48,21 +51,54 @@ class AmbiguousValueError(ValueError):
     """A plain value of a YAML file that YAML 1.1 and 1.2 read differently."""
 
 
+class RepetitionError(ValueError):
+    """Aliases of a YAML file that repeat too much."""
+
+
 class _Loader(yaml.SafeLoader):
-    """YAML's safe loader with the values of :data:`SCALARS`, and an error for a repeated key."""
+    """YAML's safe loader with the values of :data:`SCALARS`, and an error for a repeated key.
+
+    A few aliases of aliases can stand for any number of values, so that these are counted.
+    """
 
     yaml_implicit_resolvers = {}
     level = 0
 
+    def __init__(self, stream: Any) -> None:
+        super().__init__(stream)
+        self.sizes: dict[yaml.Node, int] = {}  # values in a node, itself included
+
     def compose_node(self, parent: Any, index: Any) -> Any:
         """The next node; mappings and lists may be nested :data:`MOST_LEVELS` deep."""
+        alias = self.check_event(yaml.AliasEvent)
         self.level += 1
         if self.level > MOST_LEVELS:
             raise RecursionError
         try:
-            return super().compose_node(parent, index)
+            node = super().compose_node(parent, index)
         finally:
             self.level -= 1
+        if node is None:
+            return None
+        if not alias:
+            self.sizes[node] = self.size(node)
+        elif node not in self.sizes:
+            line = node.start_mark.line + 1
+            raise RepetitionError(f"line {line}: the value contains itself by an alias")
+        return node
+
+    def size(self, node: yaml.Node) -> int:
+        """The number of values in a node whose parts are composed, itself included."""
+        parts = [] if isinstance(node, yaml.ScalarNode) else node.value
+        if isinstance(node, yaml.MappingNode):
+            parts = [one for pair in parts for one in pair]
+        values = 1 + sum(self.sizes[one] for one in parts)
+        if values > MOST_VALUES:
+            line = node.start_mark.line + 1
+            raise RepetitionError(
+                f"line {line}: more than {MOST_VALUES} values, counted with aliases"
+            )
+        return values
 
     def compose_mapping_node(self, anchor: Any) -> yaml.MappingNode:
         """The mapping as written; keys that it merges with ``<<`` may be overridden."""
@@ -101,21 +137,22 @@ def read_yaml(path: Path) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        in one line, if the file is missing, is not YAML, is not a mapping, is nested too deeply, repeats a
-        key, or has an ambiguous value.
+        in one line, if the file is missing, is not YAML, is not a mapping, is nested too deeply, has too
+        many values, repeats a key, or has an ambiguous value.
     """
+    name = path_text(path)
     try:
         data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
     except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from error
-    except (RepeatedKeyError, AmbiguousValueError) as error:
-        raise ValueError(f"{path}, {error}") from error
+        raise ValueError(f"cannot read {name}: {error.strerror}") from error
+    except (RepeatedKeyError, AmbiguousValueError, RepetitionError) as error:
+        raise ValueError(f"{name}, {error}") from error
     except RecursionError as error:
-        raise ValueError(f"{path} is nested more than {MOST_LEVELS} levels deep") from error
+        raise ValueError(f"{name} is nested more than {MOST_LEVELS} levels deep") from error
     except (yaml.YAMLError, ValueError) as error:
-        raise ValueError(f"{path} is not YAML: {' '.join(str(error).split())}") from error
+        raise ValueError(f"{name} is not YAML: {' '.join(str(error).split())}") from error
     if not isinstance(data, dict):
-        raise ValueError(f"{path} must contain a mapping, got {type(data).__name__}")
+        raise ValueError(f"{name} must contain a mapping, got {type(data).__name__}")
     return data
 
 
@@ -164,5 +201,6 @@ def read_preset_or_file(kind: str, source: str | Path, others: str = "") -> dict
     if isinstance(source, str | Path) and is_file_name(source):
         return read_yaml(Path(source))
     raise ValueError(
-        f"{kind} {str(source)!r:.60} is not one of {', '.join(names)}, nor a .yaml file{others}"
+        f"{kind} {shown(str(source))} is not one of {', '.join(names)}, nor a .yaml file{others}"
+        f"{suggestion(source, names)}"
     )

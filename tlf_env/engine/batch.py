@@ -72,7 +72,7 @@ class BatchPlant:
     ) -> None:
         if not isinstance(scenario, Sequence) or isinstance(scenario, str):
             scenario = [scenario]
-        self.scenarios = _alike([_for_lanes(source, overrides) for source in scenario])
+        self.scenarios = _alike(_all_for_lanes(scenario, overrides))
         warn_of(self.scenarios)
         self.formations = checked_count("formations", formations)
         self.threads = checked_count("threads", os.cpu_count() or 1 if threads is None else threads)
@@ -418,6 +418,19 @@ def _for_lanes(source: Source, overrides: Mapping[str, Any]) -> Scenario:
     return loaded
 
 
+def _all_for_lanes(sources: Sequence[Source], overrides: Mapping[str, Any]) -> list[Scenario]:
+    """Scenarios of plants without contact; an error names the one that it concerns."""
+    found = []
+    for number, source in enumerate(sources):
+        try:
+            found.append(_for_lanes(source, overrides))
+        except ValueError as error:
+            if len(sources) == 1:
+                raise
+            raise ValueError(f"scenario {number}: {error}") from error
+    return found
+
+
 def _alike(scenarios: list[Scenario]) -> tuple[Scenario, ...]:
     """The scenarios, which must be alike but for :data:`MAY_DIFFER`."""
     if not scenarios:
@@ -443,12 +456,19 @@ def _shares(mixture: bool | Sequence[float], scenarios: int) -> list[float]:
     """Shares that sum to 1, or none."""
     if mixture is False:
         return []
-    weights = np.ones(scenarios) if mixture is True else np.asarray(mixture, dtype=np.float64)
-    if weights.shape != (scenarios,) or not (weights >= 0).all() or not 0 < weights.sum() < np.inf:
+    weights = np.ones(scenarios) if mixture is True else real_numbers(mixture)
+    with np.errstate(over="ignore"):
+        total = np.nan if weights is None else weights.sum()
+    if (
+        weights is None
+        or weights.shape != (scenarios,)
+        or not (weights >= 0).all()
+        or not 0 < total < np.inf
+    ):
         raise ValueError(
-            f"mixture {mixture!r} must be True or {scenarios} shares, at least 0 and not all 0"
+            f"mixture {shown(mixture)} must be True or {scenarios} shares, at least 0 and not all 0"
         )
-    return (weights / weights.sum()).tolist()
+    return (weights / total).tolist()
 
 
 def checked_count(name: str, value: int) -> int:

@@ -130,18 +130,24 @@ class Formation:
         Raises
         ------
         ValueError
-            for an unknown channel, one that cannot change within an episode, or a value out of range.
+            for anything but a mapping, an unknown channel, one that cannot change within an episode, or a
+            value out of range.
         """
         arrays, robots = self.arrays, self.scenario.robot_count
         if not self.scenario.adversary:
             raise ValueError(
                 "channels can be set within an episode only if the scenario has adversary: true"
             )
+        if not isinstance(values, Mapping):
+            raise ValueError(
+                "the adversary must return a mapping of channels, {path: value or one per robot}, "
+                f"got {shown(values)}"
+            )
         arrays.imposed[:] = np.nan
         for path, value in values.items():
             if path not in SET_WITHIN_EPISODE:
                 raise ValueError(
-                    f"channel {path!r} cannot be set within an episode; there are "
+                    f"channel {shown(path)} cannot be set within an episode; there are "
                     f"{', '.join(SET_WITHIN_EPISODE)}"
                 )
             channel = CHANNELS[number(path)]
@@ -155,7 +161,7 @@ class Formation:
                 )
             if not ((row >= channel.low) & (row <= high)).all():
                 raise ValueError(
-                    f"{path} {value!r} is out of its range, {channel.low:g} to {high:g}"
+                    f"{path} {shown(value)} is out of its range, {channel.low:g} to {high:g}"
                 )
             arrays.imposed[number(path), :, 0] = row
 

@@ -37,6 +37,8 @@ from numba.core.cgutils import create_struct_proxy
 from numba.core.compiler_lock import global_compiler_lock
 from numba.extending import intrinsic
 
+from tlf_env.common.errors import shown
+
 F = TypeVar("F", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).resolve().parent.parent
@@ -72,21 +74,44 @@ def cache_folder() -> Path | None:
     It may be one that can only be read, if something was compiled into it before. Otherwise, where the
     user's cache cannot be written, it is a private folder below the system's temporary one, so that a
     driver is compiled once per machine and not once per process. None if that cannot be written either.
+    A named folder that is not used gives a warning, once in a process.
     """
-    for parent, mode in ((_named_folder, 0o755), (_temporary_folder, 0o700)):
-        try:
-            folder = parent() / sources_digest()
-            if not folder.is_dir():
-                folder.mkdir(mode, parents=True, exist_ok=True)
-            if _only_mine(folder) and (_writable(folder) or any(folder.rglob("*.nbi"))):
-                return folder
-        except OSError:
-            continue
-    return None
+    found, refused = _usable(_named_folder, 0o755)
+    if found is not None:
+        return found
+    found, _ = _usable(_temporary_folder, 0o700)
+    named = os.environ.get("TLF_ENV_CACHE")
+    if named:
+        instead = f"compiled code is kept in {found}" if found else "no compiled code is kept"
+        warnings.warn(
+            f"the folder {shown(named)} of the variable TLF_ENV_CACHE is not used: {refused}; {instead}",
+            RuntimeWarning,
+            stacklevel=2,
+        )
+    return found
+
+
+def _usable(parent: Callable[[], Path], mode: int) -> tuple[Path | None, str]:
+    """The folder of these sources in a parent, made if it is missing; or None and why it cannot be used."""
+    try:
+        folder = parent() / sources_digest()
+        if not folder.is_dir():
+            folder.mkdir(mode, parents=True, exist_ok=True)
+        if not _only_mine(folder):
+            return None, "another user owns it or may write in it"
+        if not _writable(folder) and not any(folder.rglob("*.nbi")):
+            return None, "it cannot be written, and nothing compiled is in it"
+    except OSError as error:
+        return None, error.strerror or str(error)
+    return folder, ""
 
 
 def _named_folder() -> Path:
-    folder = Path(os.environ.get("TLF_ENV_CACHE") or platformdirs.user_cache_dir("tlf_env"))
+    named = os.environ.get("TLF_ENV_CACHE")
+    try:
+        folder = Path(named).expanduser() if named else Path(platformdirs.user_cache_dir("tlf_env"))
+    except RuntimeError as error:
+        raise FileNotFoundError("the user has no home folder") from error
     if str(folder).startswith("~"):  # a user without a home
         raise FileNotFoundError(folder)
     return folder

@@ -163,12 +163,20 @@ def part_name(factory: Factory) -> str:
 
 
 def real_numbers(value: Any) -> np.ndarray | None:
-    """The value as float64, or None if it contains anything but real numbers, as text or complex."""
+    """The value as float64, or None if it contains anything but real numbers, as text or True."""
     try:
         array = np.asarray(value)
-        return array.astype(np.float64) if array.dtype.kind in "biuf" else None
+        fits = array.dtype.kind in "iuf" and not _has_switch(value)
+        return array.astype(np.float64) if fits else None
     except Exception:  # a tensor raises any kind, for example if it has a gradient
         return None
+
+
+def _has_switch(value: Any) -> bool:
+    """Whether True or False is among the values of a list; NumPy would make it a number."""
+    if isinstance(value, list | tuple):
+        return any(_has_switch(one) for one in value)
+    return isinstance(value, bool) or getattr(getattr(value, "dtype", None), "kind", "") == "b"
 
 
 def predicted(answer: Any, shape: tuple[int, ...], policy: str) -> tuple[np.ndarray, Any]:

@@ -18,7 +18,7 @@ from pydantic import (
 )
 from pydantic_core import PydanticCustomError
 
-from tlf_env.common.errors import nearest, one_line, shown
+from tlf_env.common.errors import nearest, one_line, shown, suggestion
 from tlf_env.common.files import FILE_NAME
 from tlf_env.common.models import (
     Frozen,
@@ -184,10 +184,11 @@ class Scenario(Frozen):
     def _complete_weights(cls, value: Any) -> Any:
         if not isinstance(value, Mapping):
             return value
-        unknown = sorted(set(value) - set(RewardTerms._fields))
+        unknown = [name for name in value if name not in RewardTerms._fields]
         if unknown:
             raise ValueError(
-                f"unknown term {unknown[0]!r}; the terms are {', '.join(RewardTerms._fields)}"
+                f"unknown term {shown(unknown[0])}; the terms are {', '.join(RewardTerms._fields)}"
+                f"{suggestion(unknown[0], RewardTerms._fields)}"
             )
         return {**DEFAULT_WEIGHTS._asdict(), **value}
 

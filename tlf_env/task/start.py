@@ -9,9 +9,10 @@ import numpy as np
 
 from tlf_env.common.errors import shown
 from tlf_env.onboard.parts import real_numbers
-from tlf_env.task.waypoints import MAX_COORDINATE_MM
+from tlf_env.task.waypoints import MAX_COORDINATE_MM, MAX_MAGNITUDE
 
 START_POSE_LIMIT_MM = MAX_COORDINATE_MM
+PHASE_LIMIT_S = MAX_MAGNITUDE
 OPTIONS = ("poses", "phase_s")
 
 
@@ -52,8 +53,8 @@ def start_options(
     Parameters
     ----------
     options
-        ``poses``: ``(robots, 3)``; x and y of c in mm, θ in rad. ``phase_s``: a time in s. With several
-        formations also one for each, in the first dimension.
+        ``poses``: ``(robots, 3)``; x and y of c in mm, θ in rad. ``phase_s``: a time in s within
+        ±1e9. With several formations also one for each, in the first dimension.
     robots
         Number of robots in a formation.
     formations
@@ -70,7 +71,7 @@ def start_options(
     unknown = [name for name in given if name not in OPTIONS]
     if unknown:
         raise ValueError(
-            f"reset option {unknown[0]!r} is unknown; the options are {', '.join(OPTIONS)}"
+            f"reset option {shown(unknown[0])} is unknown; the options are {', '.join(OPTIONS)}"
         )
     poses = phases_s = None
     each = "" if formations is None else f", or that for each of {formations} formations"
@@ -83,10 +84,10 @@ def start_options(
             )
     if "phase_s" in given:
         phases_s = _stacked(given["phase_s"], (), formations)
-        if phases_s is None or not np.isfinite(phases_s).all():
+        if phases_s is None or not (np.abs(phases_s) <= PHASE_LIMIT_S).all():
             raise ValueError(
                 f"reset option phase_s must be a finite number of seconds{each}, got "
-                f"{_described(given['phase_s'])}"
+                f"{_described(given['phase_s'])}; at most ±{PHASE_LIMIT_S:g} is allowed"
             )
     return Start(poses, phases_s)
 
@@ -94,7 +95,7 @@ def start_options(
 def _stacked(value: Any, shape: tuple[int, ...], formations: int | None) -> np.ndarray | None:
     """The numbers of each formation, ``(formation, *shape)``; None if they do not fit."""
     numbers = real_numbers(value)
-    if numbers is None or isinstance(value, bool):
+    if numbers is None:
         return None
     count = 1 if formations is None else formations
     if numbers.shape == shape or (formations is not None and numbers.shape == (count, *shape)):

@@ -15,6 +15,7 @@ from typing import Annotated, Any, Literal, NamedTuple, Self
 import numpy as np
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 
+from tlf_env.common.errors import shown
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive
 from tlf_env.task.waypoints import (
     MAX_COORDINATE_MM,
@@ -234,15 +235,16 @@ class Waypoints(_Timed):
         if file is None:
             return data
         if not isinstance(file, str | Path):
-            raise ValueError(f"file must be a path, got {file!r:.60}")
+            raise ValueError(f"file must be a path, got {shown(file)}")
         folder = Path((info.context or {}).get("folder", ""))
         return {**data, "file": None, "points": read_points(folder / file)}
 
     @field_validator("points", mode="before")
     @classmethod
     def _check(cls, points: Any) -> tuple[Point, ...]:
+        points = points.tolist() if isinstance(points, np.ndarray) else points
         if not isinstance(points, list | tuple):
-            raise ValueError(f"points must be a list of (t_s, x_mm, y_mm), got {points!r:.60}")
+            raise ValueError(f"points must be a list of (t_s, x_mm, y_mm), got {shown(points)}")
         return checked_points(points, "points", lambda index: f"points[{index}]")
 
     @model_validator(mode="after")

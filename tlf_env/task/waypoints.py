@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import itertools
 import math
+import re
 import sys
 from collections.abc import Callable, Sequence
 from functools import lru_cache
@@ -17,14 +18,16 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tlf_env.common.errors import shown
-from tlf_env.common.models import is_number
+from tlf_env.common.errors import path_text, shown
+from tlf_env.common.models import as_float, is_number
+from tlf_env.common.presets import DECIMAL
 from tlf_env.task.actions import FULL_SPEED_MM_S
 
 HEADER = ("t_s", "x_mm", "y_mm")
 MAX_POINTS = 100_000
 MAX_MAGNITUDE = 1e9  # s, mm
 MAX_COORDINATE_MM = 1e10  # of a place: room for every coordinate of the UTM grid
+NUMBER = re.compile(DECIMAL)
 COMMENT = "#"  # np.savetxt begins its header with it
 DEFAULT_ROBOTS = 3
 FEW_POINTS = 4  # up to this number free ends are natural: not-a-knot would overshoot
@@ -32,7 +35,9 @@ REST_SHARE = 0.25  # a free end is at rest if slower than this share of its chor
 HELD_MM = 1.0  # within this distance of a rest the heading is constant: its direction is rounding
 SEARCH_PARTS = 64  # of an interval, in the search for that distance
 
-# Times are checked after the first is subtracted: a log may count seconds since 1970.
+# Times are checked after the first is subtracted: a log may count seconds since 1970, but not
+# nanoseconds, which float64 could not tell apart.
+COARSEST_TIME_S = 1e-6
 LARGEST = {"t_s": sys.float_info.max, "x_mm": MAX_COORDINATE_MM, "y_mm": MAX_COORDINATE_MM}
 
 Point = tuple[float, float, float]
@@ -48,19 +53,22 @@ def read_points(path: Path) -> tuple[Point, ...]:
     ValueError
         in one line with the file, the line, the value and what is allowed.
     """
+    name = path_text(path)
     try:
         text = path.read_text(encoding="utf-8-sig")
     except OSError as error:
-        raise ValueError(f"cannot read {path}: {error.strerror}") from error
+        raise ValueError(f"cannot read {name}: {error.strerror}") from error
     except UnicodeDecodeError as error:
-        raise ValueError(f"{path} is not UTF-8 text: {error}") from error
+        raise ValueError(f"{name} is not UTF-8 text: {error}") from error
     reader = csv.reader(text.splitlines())
     lines: list[int] = []
     rows: list[list[str]] = []
+    comment = ""  # the last before the header
     try:
         for row in reader:
             cells = [cell.strip() for cell in row]
             if not rows and cells and cells[0].startswith(COMMENT):  # a header or a comment
+                comment = f" after the comment {shown(','.join(row))} of line {reader.line_num}"
                 cells[0] = cells[0].lstrip(COMMENT).strip()
                 if tuple(cells) != HEADER:
                     continue
@@ -68,23 +76,23 @@ def read_points(path: Path) -> tuple[Point, ...]:
                 lines.append(reader.line_num)
                 rows.append(cells)
     except csv.Error as error:
-        raise ValueError(f"{path}, line {reader.line_num}: not CSV: {error}") from error
+        raise ValueError(f"{name}, line {reader.line_num}: not CSV: {error}") from error
     if not rows or tuple(rows[0]) != HEADER:
-        found = repr(",".join(rows[0]))[:60] if rows else "an empty file"
-        raise ValueError(f"{path}, line 1: the header must be {','.join(HEADER)}, got {found}")
+        found = shown(",".join(rows[0])) if rows else "nothing" if comment else "an empty file"
+        raise ValueError(
+            f"{name}, line {lines[0] if rows else 1}: the header must be {','.join(HEADER)}, "
+            f"got {found}{comment}"
+        )
     return checked_points(
         [[_parsed(cell) for cell in row] for row in rows[1:]],
-        str(path),
-        lambda index: f"{path}, line {lines[index + 1]}",
+        name,
+        lambda index: f"{name}, line {lines[index + 1]}",
     )
 
 
 def _parsed(cell: str) -> float | str:
-    """The number in a cell; the cell itself if there is none."""
-    try:
-        return float(cell)
-    except ValueError:
-        return cell
+    """The number in a cell; the cell itself if there is none, in the digits 0 to 9 as in YAML."""
+    return float(cell) if NUMBER.fullmatch(cell) else cell
 
 
 def checked_points(
@@ -97,12 +105,19 @@ def checked_points(
     Raises
     ------
     ValueError
-        for a row that is not three finite numbers, fewer than two or too many rows, a time that does
-        not increase, no motion, or a distance that no robot can cover in the given time.
+        for a row that is not three finite numbers, a time so large that float64 has no steps of 1 µs, fewer
+        than two or too many rows, a time that does not increase, no motion, or a distance that no robot
+        can cover in the given time.
     """
     if not 2 <= len(rows) <= MAX_POINTS:
         raise ValueError(f"{whole} must have 2 to {MAX_POINTS} waypoints, got {len(rows)}")
     raw = [_numbers(row, place(i)) for i, row in enumerate(rows)]
+    for i, (t, _, _) in enumerate(raw):
+        if math.ulp(t) > COARSEST_TIME_S:
+            raise ValueError(
+                f"{place(i)}: t_s {t:.17g} is too large for steps of {COARSEST_TIME_S:g} s; "
+                "times must be in seconds"
+            )
     points = [(t - raw[0][0], x, y) for t, x, y in raw]
     for i in range(1, len(points)):
         if not points[i][0] <= MAX_MAGNITUDE:
@@ -130,17 +145,19 @@ def checked_points(
 
 
 def _numbers(row: Any, place: str) -> Point:
+    row = row.tolist() if isinstance(row, np.ndarray) else row
     if not isinstance(row, list | tuple) or len(row) != len(HEADER):
-        got = f"{len(row)}" if isinstance(row, list | tuple) else repr(row)[:60]
+        got = f"{len(row)}" if isinstance(row, list | tuple) else shown(row)
         raise ValueError(f"{place}: must be {len(HEADER)} numbers, {','.join(HEADER)}, got {got}")
     values = []
     for name, cell in zip(HEADER, row, strict=True):
         largest = LARGEST[name]
-        if not is_number(cell) or not abs(cell) <= largest:
+        value = as_float(cell) if is_number(cell) else math.nan
+        if not abs(value) <= largest:
             raise ValueError(
                 f"{place}: {name} must be a number within ±{largest:g}, got {shown(cell)}"
             )
-        values.append(float(cell))
+        values.append(value)
     return values[0], values[1], values[2]
 
 
