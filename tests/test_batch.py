@@ -327,8 +327,8 @@ def test_what_cannot_run_in_a_batch_is_told(options, said):
     ("sources", "said"),
     [
         (["infinity", {"Int": 1}], "^scenario 1: .*Int"),
-        (["infinity2", "infinity"], "^scenario 0: .*'infinty'"),
-        (["infinity2"], "^scenario 'infinty'"),
+        (["infinity2", "infinity"], "^scenario 0: .*'infinity2'"),
+        (["infinity2"], "^scenario 'infinity2'"),
     ],
 )
 def test_the_scenario_that_cannot_be_loaded_is_numbered(sources, said):

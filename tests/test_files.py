@@ -9,7 +9,7 @@ import math
 import numpy as np
 import pytest
 import yaml
-from hypothesis import given
+from hypothesis import example, given
 from hypothesis import strategies as st
 
 from baselines.benchmark.plan import read_plan
@@ -106,6 +106,7 @@ KEYS = st.from_regex(r"\A[a-zäß0-9]{1,6}\Z")
 
 
 @given(data=st.dictionaries(KEYS, st.lists(SCALARS, max_size=3), max_size=3))
+@example(data={"a": ["\x85", "x\u2028y"], "b\u2029c": "d\x85"})
 def test_what_is_written_is_read_back(data, tmp_path_factory):
     path = tmp_path_factory.mktemp("yaml") / "a.yaml"
     path.write_text(yaml_text(data), encoding="utf-8")

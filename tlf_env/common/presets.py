@@ -31,6 +31,7 @@ MOST_VALUES = (
 )
 DECIMAL = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
+BREAKS = re.compile("[\x85\u2028\u2029]")
 AMBIGUOUS = "!ambiguous"  # tag of the values that YAML 1.1 and 1.2 read differently
 SCALARS = {
     "tag:yaml.org,2002:null": r"~|null|Null|NULL|",
@@ -124,6 +125,13 @@ class _Dumper(yaml.SafeDumper):
     """YAML's safe writer, which also quotes texts that would be a number here or are ambiguous."""
 
 
+def _text(dumper: _Dumper, value: str) -> yaml.ScalarNode:
+    """A text; line breaks of Unicode are escaped, which PyYAML would read back as spaces."""
+    style = '"' if BREAKS.search(value) else None
+    return dumper.represent_scalar("tag:yaml.org,2002:str", value, style=style)
+
+
+_Dumper.add_representer(str, _text)
 for _tag, _pattern in SCALARS.items():
     _fits = re.compile(rf"(?:{_pattern})\Z")
     _Loader.add_implicit_resolver(_tag, _fits, None)
