@@ -456,3 +456,10 @@ def test_a_path_of_two_lines_is_shown_in_one(source):
     with pytest.raises(ValueError, match=r"a\\nb") as caught:
         load_scenario(source)
     assert "\n" not in str(caught.value)
+
+
+def test_very_many_errors_are_one_short_line_at_once():
+    with pytest.raises(ValueError, match="more errors") as error:
+        load_scenario("infinity", preview_s=[True] * 20_000)
+    assert len(str(error.value)) < 2000
+    assert str(error.value).endswith("and 19994 more errors")  # than the six that are shown

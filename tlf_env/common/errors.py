@@ -25,6 +25,7 @@ PYDANTICS = re.compile(
     r"valid (dictionary|tuple|string)(?: or (?:instance of \w+|object to extract fields from))?"
 )
 MOST_ERRORS = 6  # named in a line
+MOST_COMPARED = 200  # errors of one validation that are compared with each other
 CLOSENESS = 0.7  # of two names, from 0 to 1, above which one suggests the other
 FEW_NAMES = 8  # so many allowed names are all listed
 SHOWN = 60  # characters of a value, and of a key
@@ -100,7 +101,8 @@ def one_line(error: ValidationError, kind: Any, hints: Mapping[str, str] | None 
     hints
         What to say of an unknown key at the top, by key.
     """
-    found = [_placed(kind, item) for item in error.errors(include_url=False)]
+    items = error.errors(include_url=False)
+    found = [_placed(kind, item) for item in items[:MOST_COMPARED]]
     merged: dict[Any, tuple[_Found, str]] = {}
     for number, one in enumerate(_relevant(found)):
         message = _in_own_words(one.item)
@@ -115,7 +117,7 @@ def one_line(error: ValidationError, kind: Any, hints: Mapping[str, str] | None 
         else:
             merged[same] = one, message
     lines = list(dict.fromkeys(_message(one, text, hints or {}) for one, text in merged.values()))
-    more = len(lines) - MOST_ERRORS
+    more = len(lines) - MOST_ERRORS + max(len(items) - MOST_COMPARED, 0)
     return "; ".join(lines[:MOST_ERRORS]) + (f"; and {more} more errors" if more > 0 else "")
 
 
