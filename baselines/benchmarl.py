@@ -104,6 +104,6 @@ def _entries(env: EnvBase, key: str) -> Composite:
         {
             group: Composite({key: specs[group, key].clone()}, shape=specs[group].shape)
             for group in env.group_map
-            if key in specs[group].keys()  # noqa: SIM118 - `in` asks whether a tensor fits the spec
+            if key in specs[group].keys()  # noqa: SIM118 - `key in spec` tests a tensor, not a key
         }
     )

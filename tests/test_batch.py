@@ -316,7 +316,7 @@ def test_scenarios_that_differ_elsewhere_are_refused(change, said):
         ({"adversary": True, "plant": "kinematic"}, "adversary"),
     ],
 )
-def test_what_cannot_run_in_a_batch_is_told(options, said):
+def test_what_cannot_run_in_a_batch_is_named(options, said):
     options = {"formations": 1} | options
     with pytest.raises(ValueError, match=said) as caught:
         BatchPlant("infinity", **options)
@@ -352,7 +352,7 @@ def test_bad_actions_change_nothing():
         np.testing.assert_array_equal(array, old)
 
 
-def test_bad_seeds_and_masks_are_told():
+def test_bad_seeds_and_masks_are_named():
     plant = BatchPlant("infinity", 2)
     with pytest.raises(RuntimeError, match="call reset"):
         plant.step(np.zeros((2, 3, 2)))

@@ -282,7 +282,7 @@ def test_an_empty_folder_that_cannot_be_written_is_not(warm, tmp_path):
         assert chosen().is_relative_to(tmp_path / "tmp")
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs owners of files")
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owners and modes on Windows")
 @pytest.mark.parametrize("mode", [0o775, 0o757, 0o777])
 def test_code_is_not_loaded_from_a_folder_that_others_may_write(warm, tmp_path, mode):
     warm.chmod(mode)
@@ -290,7 +290,7 @@ def test_code_is_not_loaded_from_a_folder_that_others_may_write(warm, tmp_path, 
         assert chosen().is_relative_to(tmp_path / "tmp")
 
 
-@pytest.mark.skipif(not hasattr(os, "getuid"), reason="needs owners of files")
+@pytest.mark.skipif(not hasattr(os, "getuid"), reason="files have no owners and modes on Windows")
 @pytest.mark.parametrize(("owner", "taken"), [("mine", True), ("root", True), ("other", False)])
 def test_code_is_loaded_from_a_folder_of_the_user_or_root_only(warm, monkeypatch, owner, taken):
     me = warm.stat().st_uid

@@ -17,7 +17,7 @@ import pytest
 from tlf_env import BatchPlant
 
 pytestmark = [
-    pytest.mark.skipif(not hasattr(os, "fork"), reason="needs os.fork"),
+    pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no os.fork"),
     # Python itself warns of threads before a fork; that it goes well here is what is tested.
     pytest.mark.filterwarnings("ignore:.*multi-threaded:DeprecationWarning"),
 ]

@@ -44,7 +44,8 @@ AGENTS = ("robot_0", "robot_1", "robot_2")
 every_kind = pytest.mark.parametrize(("action", "observation", "plant"), KINDS)
 no_warnings = pytest.mark.filterwarnings("error")
 pettingzoo_ids = pytest.mark.skipif(
-    not hasattr(pettingzoo, "register"), reason="PettingZoo has ids from 1.27 on"
+    not hasattr(pettingzoo, "register"),
+    reason="pettingzoo.make by id exists from PettingZoo 1.27 on",
 )
 
 
@@ -468,7 +469,7 @@ def test_without_ends_a_lost_and_touching_formation_goes_on() -> None:
 # Reset options
 
 
-def test_reset_puts_the_robots_where_it_is_told() -> None:
+def test_reset_puts_the_robots_at_the_given_poses() -> None:
     env = tlf_env.parallel_env("infinity")
     poses = [put(100, 200, 0.3), put(0, -400, -2.0), put(-700, 50, 9.0)]
     _, infos = env.reset(seed=0, options={"poses": poses})

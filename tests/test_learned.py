@@ -23,7 +23,7 @@ SHORT = {"horizon_s": 0.4}
 TWIST = load_scenario(**SHORT)
 RESIDUAL = load_scenario(action="residual", residual_base="printed", preview_s=(0.5,), **SHORT)
 ENTRIES = len(tracking_entries(TWIST.preview_s))
-TOLD = {
+NOTES = {
     "algorithm": "PPO",
     "training": {"gamma": 0.99, "steps": 1000},
     "seeds": {"learner": [0]},
@@ -58,7 +58,7 @@ def written(folder, network=MLP, scenario=TWIST, name="policy", tensors=None):
     path = Path(folder) / f"{name}.safetensors"
     entries = len(tracking_entries(scenario.preview_s))
     tensors = random_tensors(network, entries) if tensors is None else tensors
-    write_policy(path, network, tensors, scenario, **TOLD)
+    write_policy(path, network, tensors, scenario, **NOTES)
     return path
 
 
@@ -332,8 +332,8 @@ def test_nothing_is_written_of_a_policy_that_is_wrong(tmp_path):
         with pytest.raises(ValueError, match="tensor"):
             written(tmp_path / "none", tensors=tensors)
     with pytest.raises(ValueError, match=r"must end in \.safetensors"):
-        write_policy(tmp_path / "a.bin", MLP, random_tensors(MLP), TWIST, **TOLD)
-    shown = TOLD | {"scores": {"return": float("nan")}}
+        write_policy(tmp_path / "a.bin", MLP, random_tensors(MLP), TWIST, **NOTES)
+    shown = NOTES | {"scores": {"return": float("nan")}}
     with pytest.raises(ValueError, match="JSON"):
         write_policy(tmp_path / "a.safetensors", MLP, random_tensors(MLP), TWIST, **shown)
     assert not list(tmp_path.iterdir())

@@ -115,7 +115,10 @@ def test_parallel_seeds(scenario):
     parallel_seed_test(lambda: tlf_env.parallel_env(scenario), num_cycles=300)
 
 
-@pytest.mark.skipif(not hasattr(pettingzoo, "register"), reason="PettingZoo has ids from 1.27 on")
+@pytest.mark.skipif(
+    not hasattr(pettingzoo, "register"),
+    reason="pettingzoo.make by id exists from PettingZoo 1.27 on",
+)
 def test_registered_names():
     env = pettingzoo.make("parallel", "tlf_env/flower-v0", robots=2)
     assert env.scenario.name == "flower"
@@ -685,7 +688,7 @@ def test_time_gap_error_is_how_late_a_follower_is():
     assert all(info["time_gap_error_s"] == 0 for step in steps[:99] for info in step[4].values())
 
 
-def test_torques_stay_within_their_limit_and_saturation_is_told():
+def test_torques_stay_within_their_limit_and_saturation_is_reported():
     env = make(end_on=())
     steps = play(env, env.reset(seed=0)[0], 300)
     infos = [info for step in steps for info in step[4].values()]

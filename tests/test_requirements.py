@@ -49,7 +49,7 @@ def test_the_extra_view_makes_videos_too() -> None:
     assert {"moviepy", "pygame-ce"} <= names
 
 
-@pytest.mark.skipif(shutil.which("make") is None, reason="needs make")
+@pytest.mark.skipif(shutil.which("make") is None, reason="make is not installed")
 def test_the_check_of_clients_runs_each_of_them():
     done = subprocess.run(
         ["make", "-n", "check-clients"], cwd=ROOT, capture_output=True, text=True, check=True

@@ -181,7 +181,7 @@ def test_impossible_options_are_refused_at_once(options, says):
     assert "\n" not in str(error.value)
 
 
-@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="Windows has no os.fork")
 def test_a_forked_child_steps_after_two_threads_did():
     env = environment(64, threads=2)
     env.seed(0)

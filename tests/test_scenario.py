@@ -540,7 +540,7 @@ def test_what_is_not_constantly_weak_does_not_warn(disturbance):
     assert grip_warnings(disturbance=disturbance) == []
 
 
-def test_a_motor_that_gives_nothing_is_told():
+def test_a_motor_that_gives_nothing_is_warned_of():
     dead = {"actuator": {"torque_gain_l": 0.0, "torque_gain_r": 0.0}}
     assert any(
         "above 0 (on a straight the motors give 0" in line
@@ -613,7 +613,7 @@ def test_a_start_beyond_the_world_is_told_with_its_place():
     assert "6 robots in all" in line
 
 
-def test_a_horizon_beyond_the_clock_is_told():
+def test_a_horizon_beyond_the_clock_is_warned_of():
     assert sensor_lines(horizon_s=1000.0) == []
     (line,) = sensor_lines(horizon_s=1000.02)
     assert "t = 1000 s" in line

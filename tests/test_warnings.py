@@ -87,11 +87,13 @@ def test_several_scenarios_are_named_and_each_line_comes_once():
     assert len(set(lines)) == len(lines)
     mine, others = scenario_warnings(fast), scenario_warnings(weak)
     for line in {*mine, *others}:
-        (told,) = [one for one in lines if one.endswith(line)]
+        (found,) = [one for one in lines if one.endswith(line)]
         if line in mine and line in others:
-            assert told == line
+            assert found == line
         else:
-            assert told.startswith("scenario 2: " if line in others else "scenario 0; scenario 1: ")
+            assert found.startswith(
+                "scenario 2: " if line in others else "scenario 0; scenario 1: "
+            )
 
 
 def test_many_names_are_counted():

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+from abc import abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, cast
@@ -22,17 +23,30 @@ from tlf_env.task.scenario import Scenario
 BY_REFERENCE = "reference"
 
 
-def with_length(spec: EnvSpec | None, scenario: Scenario) -> EnvSpec | None:
-    """A copy of Gymnasium's specification whose ``max_episode_steps`` is the scenario's horizon."""
-    if spec is None:
-        return None
-    changed = copy.deepcopy(spec)
-    changed.max_episode_steps = scenario.horizon_steps
-    return changed
+class HasSpec:
+    """The property ``spec`` of an environment with a scenario."""
+
+    _spec: EnvSpec | None = None
+
+    @property
+    @abstractmethod
+    def scenario(self) -> Scenario:
+        """The scenario, whose horizon is the length."""
+
+    @property
+    def spec(self) -> EnvSpec | None:
+        """Gymnasium's specification, with the steps of an episode; None without Gymnasium's makers."""
+        return self._spec
+
+    @spec.setter
+    def spec(self, value: EnvSpec | None) -> None:
+        self._spec = copy.deepcopy(value)
+        if self._spec is not None:
+            self._spec.max_episode_steps = self.scenario.horizon_steps
 
 
 @documented
-class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
     """One learner in a formation; a policy drives the other robots.
 
     Actions, observations, rewards and infos are those of the learner in
@@ -82,7 +96,6 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.formation_env = FormationParallelEnv(
             scenario, render_mode=render_mode, infos=infos, **overrides
         )
-        self._spec: EnvSpec | None = None
         agents = self.formation_env.possible_agents
         if learner is None:
             learner = agents[min(1, len(agents) - 1)]
@@ -122,15 +135,6 @@ class FormationEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def scenario(self) -> Scenario:
         """Everything that an episode depends on, except the seed."""
         return self.formation_env.scenario
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Gymnasium's specification, with the steps of an episode; None without ``gymnasium.make``."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._spec = with_length(value, self.scenario)
 
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None

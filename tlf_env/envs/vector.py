@@ -9,7 +9,6 @@ from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.envs.registration import EnvSpec
 from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
@@ -18,7 +17,7 @@ from tlf_env.common.errors import shown
 from tlf_env.engine import judging
 from tlf_env.engine.batch import BatchPlant, checked_count
 from tlf_env.engine.excerpt import END_ROW, REWARD_ROW, Excerpt
-from tlf_env.envs.single import BY_REFERENCE, with_length
+from tlf_env.envs.single import BY_REFERENCE, HasSpec
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE
 from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
@@ -50,7 +49,7 @@ def shortened(scenario: Any, max_episode_steps: int, overrides: dict[str, Any]) 
     return {"horizon_s": steps * first.control_period_s}
 
 
-class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
+class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     """Many formations with one learner each; the reference controller drives the other robots.
 
     Sub-environment k with seed s equals :class:`~tlf_env.envs.single.FormationEnv` with seed s + k, bit
@@ -111,7 +110,6 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         if max_episode_steps is not None:
             overrides |= shortened(scenario, max_episode_steps, overrides)
         self.plant = BatchPlant(scenario, num_envs, threads=threads, mixture=mixture, **overrides)
-        self._spec: EnvSpec | None = None
         self._info_keys = chosen_keys(infos)
         self._mask_keys = [f"_{key}" for key in self._info_keys]
         self._info_rows = [INFO_KEYS.index(key) for key in self._info_keys]
@@ -156,15 +154,6 @@ class FormationVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
     def scenario(self) -> Scenario:
         """Everything that an episode depends on, except the seed; of several scenarios, the first."""
         return self.plant.scenario
-
-    @property
-    def spec(self) -> EnvSpec | None:
-        """Gymnasium's specification, with the steps of an episode; None without ``make_vec``."""
-        return self._spec
-
-    @spec.setter
-    def spec(self, value: EnvSpec | None) -> None:
-        self._spec = with_length(value, self.scenario)
 
     def reset(
         self,
