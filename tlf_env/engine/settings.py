@@ -19,6 +19,7 @@ class Settings(NamedTuple):
 
     kinematic: bool
     collides: bool  # robots that are near are stepped through a space with contact
+    round_outlines: bool  # outlines are circles, so that compiled laws can say which touch
     substeps: int
     dt: float  # physics period, s
     period: float  # control period, s
@@ -51,6 +52,7 @@ def make_settings(scenario: Scenario) -> Settings:
     return Settings(
         kinematic=scenario.plant == "kinematic",
         collides=scenario.plant == "pymunk",
+        round_outlines=all(one.outline_polygon_mm is None for one in scenario.robot_models),
         substeps=scenario.substeps,
         dt=scenario.physics_period_s,
         period=scenario.control_period_s,

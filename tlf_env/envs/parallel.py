@@ -341,11 +341,16 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                         "radius_mm": patch.radius,
                         "scale": patch.scale,
                     }
-                    for patch in map(PatchRow._make, patch_rows(self.scenario.disturbance).tolist())
+                    for patch in map(PatchRow._make, self._patches())
                     if patch.scale != 1  # otherwise the patch has no effect
                 ],
             )
         return self._renderer.draw(scene_of(self._formation))
+
+    def _patches(self) -> list[list[float]]:
+        scenario = self.scenario
+        rows: list[list[float]] = patch_rows(scenario.disturbance, scenario.world.patches).tolist()
+        return rows
 
     def _path_mm(self) -> np.ndarray:
         return self._formation.leader_path()

@@ -13,6 +13,7 @@ import numpy as np
 
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 from tlf_env.physics.vehicle import RobotParameters, body
+from tlf_env.physics.world import World, capsules_of, gaps_to_capsule
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import OBSERVATION_LIMIT, SAMPLE_ENTRIES, SENSOR_TAIL_ENTRIES
 from tlf_env.task.trajectories import Trajectory, sample
@@ -143,6 +144,36 @@ def warnings_for(
         *_motors(t_s, reference, robot),
         *_grip(t_s, reference, robot),
         *_meetings(t_s, reference, robot, robots, gap_steps, start_spacing_mm),
+    ]
+
+
+def wall_warnings(
+    trajectory: Trajectory, robot: RobotParameters, world: World, horizon_s: float
+) -> list[str]:
+    """A line if the reference passes through walls or obstacles of the world within the horizon.
+
+    The line gives the first place at which the robot's outline (the circle around it) overlaps one, and how
+    many others the path meets. Things that move or can be pushed do not count.
+    """
+    t_s, _ = _times(horizon_s, horizon_s)
+    reference = sample(trajectory, t_s)
+    ahead = np.stack([-np.sin(reference[:, 2]), np.cos(reference[:, 2])], axis=1)
+    centres = reference[:, :2] - robot.outline_offset_mm * ahead
+    met = []
+    for name in ("walls", "obstacles"):
+        for number, thing in enumerate(getattr(world, name)):
+            room = np.min([gaps_to_capsule(one, centres) for one in capsules_of(thing)], axis=0)
+            if (room < robot.outline_radius_mm).any():
+                first = _first(room < robot.outline_radius_mm)
+                deepest = robot.outline_radius_mm - float(room.min())
+                met.append((first, f"world.{name}[{number}]", deepest))
+    if not met:
+        return []
+    first, name, deepest = min(met)
+    more = f"; it meets {len(met) - 1} more" if len(met) > 1 else ""
+    return [
+        f"{_place(t_s, reference, first)}: the path leads the outline of a robot up to {deepest:.0f} mm "
+        f"into {name}{more}"
     ]
 
 
