@@ -343,7 +343,8 @@ class PymunkPlant:
         """Set the impulses that constraints remember to 0; to be called before a control step.
 
         A copy of a space does not have them, so that it could not go on as the original does. A step with a
-        largest force of 0, in a space without bodies, clears them. Springs remember nothing.
+        largest force of 0, in a space without bodies, clears them; it takes them from the bodies' velocities,
+        which are put back. Springs remember nothing.
         """
         constraints = list(self._space.constraints)
         if not constraints:
@@ -351,12 +352,16 @@ class PymunkPlant:
         clamped = [one for one in constraints if not isinstance(one, SPRINGS)]
         self._space.remove(*constraints)
         kept = [(one.max_force, one.pre_solve, one.post_solve) for one in clamped]
+        bodies = {body for one in clamped for body in (one.a, one.b)}
+        twists = [(body, body.velocity, body.angular_velocity) for body in bodies]
         empty = pymunk.Space()
         for one in clamped:
             one.max_force, one.pre_solve, one.post_solve = 0.0, None, None
             empty.add(one)
         empty.step(1.0)
         empty.remove(*clamped)
+        for body, velocity, turning in twists:
+            body.velocity, body.angular_velocity = velocity, turning
         for one, (max_force, before, after) in zip(clamped, kept, strict=True):
             one.max_force, one.pre_solve, one.post_solve = max_force, before, after
         self._space.add(*constraints)
