@@ -304,12 +304,13 @@ class PymunkPlant:
             if body.shapes and not _is_still(body):
                 farthest = max(farthest, _fastest_point(body) * dt / half_thickness(body))
         parts = min(max(1, math.ceil(farthest / LARGEST_MOVE)), MOST_SPLITS)
-        if self._corrections:
-            self._step_after_a_copy(dt / parts)
-        else:
-            self._space.step(dt / parts)
-        for _ in range(parts - 1):
-            self._space.step(dt / parts)
+        for _ in range(parts):
+            if self._corrections:
+                self._step_after_a_copy(dt / parts)
+            else:
+                self._space.step(dt / parts)
+            for i, body in enumerate(self.bodies):
+                body.each_arbiter(self._remember, i)
 
     def _write(self, poses: np.ndarray, velocities: np.ndarray) -> None:
         for i, body in enumerate(self.bodies):
@@ -375,10 +376,9 @@ class PymunkPlant:
         """
         self._write(before, motions)
         self._moved_before, self._moved = self._moved, set()
-        self._step_space(dt)
         self.hits = {}
+        self._step_space(dt)
         for i, body in enumerate(self.bodies):
-            body.each_arbiter(self._remember, i)
             if body.constraints or _is_forced(body):
                 self._moved.add(i)
         for i in self._moved | self._moved_before:
