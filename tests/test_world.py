@@ -147,9 +147,7 @@ THIN = [[-20.0, -60.0], [20.0, -60.0], [20.0, 60.0], [-20.0, 60.0]]
 
 @pytest.mark.parametrize("dt", [0.0001, 0.001, 0.005, 0.02, 0.1])
 @pytest.mark.parametrize("speed", [100.0, 1000.0, 10000.0])
-@pytest.mark.parametrize(
-    "outline", [{}, {"outline_radius_mm": 20.0}, {"outline_polygon_mm": THIN}]
-)
+@pytest.mark.parametrize("outline", [{}, {"outline_radius_mm": 20.0}, {"outline_polygon_mm": THIN}])
 def test_nothing_tunnels_through_a_line(dt, speed, outline):
     """Whatever the speed and the substep: a robot, and a thin box that a robot throws, stay on their side."""
     if speed * dt < 0.1:
@@ -192,7 +190,9 @@ def driven(env, steps, action=(0.6, 0.0), observations=False):
     rows = []
     for _ in range(steps):
         seen, _, _, _, infos = env.step(dict.fromkeys(env.agents, np.array(action)))
-        rows.append([[i["x_mm"], i["y_mm"], i["theta_rad"], i["touched_by"]] for i in infos.values()])
+        rows.append(
+            [[i["x_mm"], i["y_mm"], i["theta_rad"], i["touched_by"]] for i in infos.values()]
+        )
         if observations:
             rows.append(np.stack(list(seen.values())).tolist())
     return rows

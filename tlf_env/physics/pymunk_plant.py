@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pymunk
+from pymunk.batch import BodyFields, Buffer, get_space_bodies
 
 from tlf_env.physics.objects import (
     Mover,
@@ -42,7 +43,15 @@ REACH_MM = 10.0  # objects that could come closer to an outline than this are wi
 FASTEST_CHANGE_MM_S2 = 1500.0  # of a robot's velocity, as in tlf_env.engine.outlines
 # With these, steps are counted in which objects stay out of reach.
 CALM_CHANGE_MM_S2 = 6000.0
-MOST_CALM_S = 1.0
+MOST_CALM_S = 2.0
+STIRRED = (
+    BodyFields.POSITION
+    | BodyFields.ANGLE
+    | BodyFields.VELOCITY
+    | BodyFields.ANGULAR_VELOCITY
+    | BodyFields.FORCE
+    | BodyFields.TORQUE
+)
 # A body can pass through a thin one only if it moves farther in a step than half its own thickness.
 LARGEST_MOVE = 0.25  # of that, within a step of the space
 LEAST_HALF_MM = 0.5  # a body that is thinner counts as so thick
@@ -124,7 +133,8 @@ class PymunkPlant:
         self._floor = [joint for one in self._pushed for joint in one.joints]
         self._rests: dict[pymunk.Body, Rest] = {one.body: _rest(one.body) for one in self._pushed}
         self._shared = False  # whether a user has had the space
-        self._own = self._seen = self._counts()
+        self._buffer = Buffer()
+        self._calm: tuple[Any, ...] = ()
         self.reset()
 
     def reset(
@@ -165,7 +175,8 @@ class PymunkPlant:
         self._moved_before: set[int] = set()
         self._corrections: list[Correction] = []
         self._calm_until = 0  # control step before which no object can be within reach
-        self._still: list[tuple[pymunk.Body, tuple[float, float], float]] = []
+        self._pulled: set[int] = set()  # robots with forces, constraints or functions of the user's
+        self._forces: list[tuple[pymunk.Body, tuple[float, float], float]] = []
         self.hits: dict[
             int, int
         ] = {}  # of a substep: robots, and the type of body that each touched
@@ -193,9 +204,21 @@ class PymunkPlant:
             mover.place(step * self._period_s, self._period_s)
             self._space.reindex_shapes_for_body(mover.body)
 
-    def _counts(self) -> tuple[int, int, int]:
-        space = self._space
-        return len(space.shapes), len(space.bodies), len(space.constraints)
+    def _stir(self) -> tuple[Any, ...]:
+        """What would differ if a user had added, moved, or pulled at anything but a static shape.
+
+        One call of pymunk for all bodies: this is read in every control step.
+        """
+        space, buffer = self._space, self._buffer
+        buffer.clear()
+        get_space_bodies(space, STIRRED, buffer)
+        return (
+            len(space.shapes),
+            len(space.constraints),
+            bytes(buffer.float_buf()),
+            [body.velocity_func for body in space.bodies],
+            [body.position_func for body in space.bodies],
+        )
 
     def objects(self, motions: np.ndarray, step: int) -> int:
         """What objects could do within a control step: all but the walls of the world.
@@ -205,15 +228,11 @@ class PymunkPlant:
         """
         if not (self._shared or self._pushed or self._movers):
             return NO_OBJECTS
-        space, robots = self._space, self.bodies
-        if self._shared and any(_is_forced(body) for body in robots):
+        if step < self._calm_until and self._stir() == self._calm:
+            return NO_OBJECTS
+        space = self._space
+        if any(_is_forced(body) for body in self.bodies):
             return WITHIN_REACH
-        counts = self._counts()
-        if counts == self._own and not self._pushed and not self._movers:
-            return NO_OBJECTS
-        if step < self._calm_until and counts == self._seen and self._nothing_stirred():
-            return NO_OBJECTS
-        self._seen = counts
         own = {mover.body for mover in self._movers}
         loose = [
             body
@@ -242,7 +261,7 @@ class PymunkPlant:
         if moving or (self._movers and loose):
             return OUT_OF_REACH
         self._calm_until = step + int(calm_s / self._period_s)
-        self._still = [(body, body.position, body.angle) for body in loose]
+        self._calm = self._stir()
         return NO_OBJECTS
 
     def _calm_time(self, fastest: float) -> float:
@@ -271,17 +290,6 @@ class PymunkPlant:
                 calm_s = min(calm_s, time_for(speed, apart - REACH_MM))
         return calm_s
 
-    def _nothing_stirred(self) -> bool:
-        """Whether all bodies that can be pushed are where they were, at rest and without forces."""
-        floor = self._floor
-        return all(
-            body.position == position
-            and body.angle == angle
-            and _is_still(body)
-            and not _is_forced(body, floor)
-            for body, position, angle in self._still
-        )
-
     def _stop_on_floor(self) -> None:
         """Stop pushed bodies that rounding keeps in motion."""
         for one in self._pushed:
@@ -293,6 +301,7 @@ class PymunkPlant:
         """Run so many substeps of the space while the robots stand where they are."""
         self._write(motions, np.zeros_like(motions))
         self._place_movers(step)
+        self._hold_forces()
         self._forget_constraints()
         for _ in range(substeps):
             self._step_space(dt)
@@ -305,6 +314,8 @@ class PymunkPlant:
                 farthest = max(farthest, _fastest_point(body) * dt / half_thickness(body))
         parts = min(max(1, math.ceil(farthest / LARGEST_MOVE)), MOST_SPLITS)
         for _ in range(parts):
+            for body, force, torque in self._forces:
+                body.force, body.torque = force, torque
             if self._corrections:
                 self._step_after_a_copy(dt / parts)
             else:
@@ -327,6 +338,7 @@ class PymunkPlant:
         type leaves the index and enters it again, and keeps its contacts. Two robots have only one.
         """
         self._place_movers(step)
+        self._hold_forces()
         self._forget_constraints()
         if len(self.bodies) <= 2 and len(self._space.shapes) == len(self.bodies):
             return
@@ -339,6 +351,15 @@ class PymunkPlant:
                 outline.cache_bb()
             body.body_type = pymunk.Body.DYNAMIC
             body.mass, body.moment = robot.m, robot.I
+
+    def _hold_forces(self) -> None:
+        """Remember the forces on bodies, which Chipmunk forgets after a step, for the whole control step."""
+        self._forces = [
+            (body, body.force, body.torque)
+            for body in self._space.bodies
+            if body.force != (0.0, 0.0) or body.torque
+        ]
+        self._pulled = {i for i, body in enumerate(self.bodies) if _is_forced(body)}
 
     def _forget_constraints(self) -> None:
         """Set the impulses that constraints remember to 0; to be called before a control step.
@@ -378,9 +399,7 @@ class PymunkPlant:
         self._moved_before, self._moved = self._moved, set()
         self.hits = {}
         self._step_space(dt)
-        for i, body in enumerate(self.bodies):
-            if body.constraints or _is_forced(body):
-                self._moved.add(i)
+        self._moved |= self._pulled
         for i in self._moved | self._moved_before:
             body = self.bodies[i]
             motions[X, i, 0], motions[Y, i, 0] = body.position
@@ -423,7 +442,10 @@ class PymunkPlant:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
         if not self._corrections:
             self._corrections = [_take_correction(body) for body in self._space.bodies]
-        return self.__dict__.copy()
+        return {**self.__dict__, "_buffer": None, "_calm": ()}
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _buffer=Buffer())
 
 
 def way(speed: float, time_s: float) -> float:
