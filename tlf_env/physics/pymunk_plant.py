@@ -26,6 +26,7 @@ from tlf_env.physics.objects import (
     damped_velocity,
 )
 from tlf_env.physics.parameters import Body, RobotParameters, body_array
+from tlf_env.physics.reach import CLOSE_MARGIN_MM, FASTEST_CHANGE_MM_S2, time_for, way
 from tlf_env.physics.state import Motion
 from tlf_env.physics.world import World
 
@@ -39,11 +40,7 @@ X, Y, THETA, V_X, V_Y, YAW = (
 
 # What the objects in the space do within a control step, walls of the world apart.
 NO_OBJECTS, OUT_OF_REACH, WITHIN_REACH = range(3)
-REACH_MM = 10.0  # objects that could come closer to an outline than this are within reach
-FASTEST_CHANGE_MM_S2 = 1500.0  # of a robot's velocity, as in tlf_env.engine.outlines
-# With these, steps are counted in which objects stay out of reach.
-CALM_CHANGE_MM_S2 = 6000.0
-MOST_CALM_S = 2.0
+MOST_CALM_S = 2.0  # so long objects may be taken to be out of reach without another look
 STIRRED = (
     BodyFields.POSITION
     | BodyFields.ANGLE
@@ -278,8 +275,8 @@ class PymunkPlant:
             size = math.hypot(box.right - box.left, box.top - box.bottom) / 2
             if isinstance(outline, pymunk.Circle):
                 size = outline.radius
-            room = REACH_MM + (speed + 2.0 * FASTEST_CHANGE_MM_S2 * period_s) * period_s
-            wide = size + REACH_MM + way(speed, MOST_CALM_S)
+            room = CLOSE_MARGIN_MM + (speed + 2.0 * FASTEST_CHANGE_MM_S2 * period_s) * period_s
+            wide = size + CLOSE_MARGIN_MM + way(speed, MOST_CALM_S)
             near = pymunk.BB(centre[0] - wide, centre[1] - wide, centre[0] + wide, centre[1] + wide)
             for shape in space.bb_query(near, pymunk.ShapeFilter()):
                 if shape.body in self._number or shape in self._walls:
@@ -287,7 +284,7 @@ class PymunkPlant:
                 apart = shape.point_query(centre).distance - size
                 if apart <= room:
                     return -1.0
-                calm_s = min(calm_s, time_for(speed, apart - REACH_MM))
+                calm_s = min(calm_s, time_for(speed, apart - CLOSE_MARGIN_MM))
         return calm_s
 
     def _stop_on_floor(self) -> None:
@@ -446,17 +443,6 @@ class PymunkPlant:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _buffer=Buffer())
-
-
-def way(speed: float, time_s: float) -> float:
-    """How far something may come in a time, mm, that may change its speed by ``CALM_CHANGE_MM_S2``."""
-    return (speed + CALM_CHANGE_MM_S2 / 2.0 * time_s) * time_s
-
-
-def time_for(speed: float, way_mm: float) -> float:
-    """In what time :func:`way` is so long, s."""
-    change = CALM_CHANGE_MM_S2
-    return (math.sqrt(speed * speed + 2.0 * change * max(way_mm, 0.0)) - speed) / change
 
 
 def half_thickness(body: pymunk.Body) -> float:
