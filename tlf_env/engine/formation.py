@@ -37,13 +37,14 @@ from tlf_env.physics.vehicle import Body
 from tlf_env.task.info import Info, TouchedBy
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.start import Start
-from tlf_env.task.trajectories import sample
+from tlf_env.task.trajectories import reference_from
 
 
 def reference_table(scenario: Scenario, phase_s: float = 0.0) -> np.ndarray:
     """The leader's reference at every control step of an episode and of its preview, (step, 5)."""
     steps = scenario.horizon_steps + max(scenario.preview_steps, default=0) + 1
-    return sample(scenario.trajectory, phase_s + np.arange(steps) * scenario.control_period_s)
+    t_s = np.arange(steps) * scenario.control_period_s
+    return reference_from(scenario.trajectory, t_s, scenario.start_ramp_s, phase_s)
 
 
 # Each entry of State is divided by its scale in the interface.

@@ -16,7 +16,7 @@ from tlf_env.physics.vehicle import RobotParameters, body
 from tlf_env.physics.world import World, capsules_of, gaps_to_capsule
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import OBSERVATION_LIMIT, SAMPLE_ENTRIES, SENSOR_TAIL_ENTRIES
-from tlf_env.task.trajectories import Trajectory, sample
+from tlf_env.task.trajectories import Trajectory, reference_from, sample
 
 SAMPLE_S = 0.01
 MAX_SAMPLES = 200_000
@@ -128,6 +128,7 @@ def warnings_for(
     robots: int = 1,
     time_gap_s: float = 5.0,
     start_spacing_mm: float = 300.0,
+    start_ramp_s: float = 0.0,
 ) -> list[str]:
     """A line for each limit of the robots that the reference exceeds within the horizon.
 
@@ -136,7 +137,7 @@ def warnings_for(
     and start ``start_spacing_mm`` apart. Each line gives the worst place, the value and the limit.
     """
     t_s, gap_steps = _times(horizon_s, time_gap_s)
-    reference = sample(trajectory, t_s)
+    reference = reference_from(trajectory, t_s, start_ramp_s)
     return [
         *_rests(t_s, reference),
         *_speed(t_s, reference),
@@ -148,7 +149,11 @@ def warnings_for(
 
 
 def wall_warnings(
-    trajectory: Trajectory, robot: RobotParameters, world: World, horizon_s: float
+    trajectory: Trajectory,
+    robot: RobotParameters,
+    world: World,
+    horizon_s: float,
+    start_ramp_s: float = 0.0,
 ) -> list[str]:
     """A line if the reference passes through walls or obstacles of the world within the horizon.
 
@@ -156,7 +161,7 @@ def wall_warnings(
     many others the path meets. Things that move or can be pushed do not count.
     """
     t_s, _ = _times(horizon_s, horizon_s)
-    reference = sample(trajectory, t_s)
+    reference = reference_from(trajectory, t_s, start_ramp_s)
     ahead = np.stack([-np.sin(reference[:, 2]), np.cos(reference[:, 2])], axis=1)
     centres = reference[:, :2] - robot.outline_offset_mm * ahead
     met = []
@@ -184,6 +189,7 @@ def sensor_warnings(
     robots: int = 1,
     time_gap_s: float = 5.0,
     start_spacing_mm: float = 300.0,
+    start_ramp_s: float = 0.0,
 ) -> list[str]:
     """A line for each quantity that the observation ``sensor`` clips within the horizon.
 
@@ -192,7 +198,7 @@ def sensor_warnings(
     up to i gaps before the horizon. Each line gives the first place, the value and the limit.
     """
     t_s, gap_steps = _times(horizon_s, time_gap_s)
-    reference = sample(trajectory, t_s)
+    reference = reference_from(trajectory, t_s, start_ramp_s)
     x, y, theta = reference[0, :3]
     behind = start_spacing_mm * np.arange(robots)[:, None]
     starts = np.array([x, y]) + behind * np.array([math.sin(theta), -math.cos(theta)])

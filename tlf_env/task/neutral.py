@@ -42,6 +42,7 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "robot": {},
         "time_gap_s": 5.0,
         "start_spacing_mm": 300.0,
+        "start_ramp_s": 0.0,
         "physics_period_s": 0.001,
         "control_period_s": 0.02,
         "horizon_s": 100.0,

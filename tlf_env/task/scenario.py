@@ -124,6 +124,8 @@ class Scenario(Frozen):
     robot: RobotParameters = RobotParameters()
     time_gap_s: Positive = 5.0
     start_spacing_mm: Annotated[Positive, Field(le=MAX_MAGNITUDE)] = 300.0
+    # Time in which the leader's reference gets from rest to the speed of its trajectory; 0: at once.
+    start_ramp_s: Annotated[NonNegative, Field(le=MAX_MAGNITUDE)] = 0.0
 
     physics_period_s: Positive = 0.001
     control_period_s: Positive = DEFAULT_CONTROL_PERIOD_S
@@ -434,7 +436,7 @@ def name_of(path: Path) -> str:
 
 @functools.lru_cache(maxsize=64)
 def _warnings_for(*what: Any) -> tuple[str, ...]:
-    trajectory, robot, horizon_s, robots, time_gap_s, start_spacing_mm = what
+    trajectory, robot, horizon_s, robots, time_gap_s, start_spacing_mm, start_ramp_s = what
     return tuple(
         warnings_for(
             trajectory,
@@ -443,6 +445,7 @@ def _warnings_for(*what: Any) -> tuple[str, ...]:
             robots=robots,
             time_gap_s=time_gap_s,
             start_spacing_mm=start_spacing_mm,
+            start_ramp_s=start_ramp_s,
         )
     )
 
@@ -483,6 +486,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             scenario.robot_count,
             scenario.time_gap_s,
             scenario.start_spacing_mm,
+            scenario.start_ramp_s,
         )
     ]
     if scenario.world.statics:
@@ -490,7 +494,11 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             line
             for robot in dict.fromkeys(scenario.robot_models)
             for line in _wall_warnings(
-                scenario.trajectory, robot, scenario.world, scenario.horizon_s
+                scenario.trajectory,
+                robot,
+                scenario.world,
+                scenario.horizon_s,
+                scenario.start_ramp_s,
             )
         ]
     lines += _contact_warnings(scenario)
@@ -501,6 +509,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             robots=scenario.robot_count,
             time_gap_s=scenario.time_gap_s,
             start_spacing_mm=scenario.start_spacing_mm,
+            start_ramp_s=scenario.start_ramp_s,
         )
     if scenario.estimator == "ekf" and controller(scenario.residual_base).limits.cancel_slip:
         lines.append(
@@ -512,6 +521,8 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
 
 def scenario_notes(scenario: Scenario) -> list[str]:
     """A line for each note on the scenario that is not a warning."""
+    if scenario.start_ramp_s > 0:
+        return []
     note = start_note(scenario.trajectory, _disturbed_robots(scenario)[0])
     return [] if note is None else [note]
 

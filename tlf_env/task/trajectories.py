@@ -351,3 +351,30 @@ def sample(trajectory: Trajectory, t_s: np.ndarray) -> np.ndarray:
     turn = np.divide(d_x * r_y - d_y * r_x, square, out=np.zeros_like(square), where=square > 0)
     theta = np.unwrap(np.arctan2(-d_x, d_y))
     return np.stack([x, y, theta, speed, turn], axis=-1)
+
+
+def started(t_s: np.ndarray, ramp_s: float) -> tuple[np.ndarray, np.ndarray]:
+    """Time on the trajectory (s) at times after the start, and the rate at which it passes, each ``(time,)``.
+
+    Within ``ramp_s`` the rate grows smoothly from 0 to 1, as 3x² − 2x³ with x = t/ramp; afterwards the
+    reference is half a ramp behind one that starts at speed.
+    """
+    x = np.clip(t_s / ramp_s, 0.0, 1.0)
+    ramping = ramp_s * (x**3 - x**4 / 2)
+    return np.where(t_s < ramp_s, ramping, t_s - ramp_s / 2), 3 * x**2 - 2 * x**3
+
+
+def reference_from(
+    trajectory: Trajectory, t_s: np.ndarray, ramp_s: float = 0.0, phase_s: float = 0.0
+) -> np.ndarray:
+    """:func:`sample` of the reference at times after its start, ``(len(t_s), 5)``.
+
+    It starts ``phase_s`` later on its trajectory; from rest, if ``ramp_s`` is above 0: see :func:`started`.
+    """
+    t_s = np.asarray(t_s, dtype=np.float64)
+    if ramp_s == 0.0:
+        return sample(trajectory, phase_s + t_s)
+    course_s, rate = started(t_s, ramp_s)
+    rows = sample(trajectory, phase_s + course_s)
+    rows[:, 3:] *= rate[:, None]
+    return rows
