@@ -220,8 +220,8 @@ def test_reach_is_the_range_of_values(fields, reach):
     assert out.max() <= high + 1e-12
 
 
-def test_rows_are_five_numbers():
-    assert len(SignalRow._fields) == 5
+def test_rows_are_six_numbers():
+    assert len(SignalRow._fields) == 6
     assert all(isinstance(x, int | float) for x in signal(type="gaussian", std=1).row(DT_S, DT_S))
 
 
@@ -248,3 +248,67 @@ def test_impossible_signals_are_refused_in_one_line(fields, words):
     line = refusal(**fields)
     for word in words:
         assert word in line
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"type": "uniform", "low": -60.0, "high": 60.0, "every_s": 0.5},
+        {"type": "gaussian", "std": 20.0, "every_s": 0.5},
+        {"type": "uniform", "low": 5.0, "high": 9.0},
+    ],
+)
+def test_a_ramp_leads_to_the_same_draws_without_a_jump(fields):
+    ticks = range(3000)
+    steps, ramps = values(fields, ticks), values({**fields, "ramp_s": 0.2}, ticks)
+    assert ramps[0] == 0.0  # nominal
+    since = np.arange(3000) % 500 if "every_s" in fields else np.arange(3000)
+    assert (ramps[since >= 200] == steps[since >= 200]).all()
+    most = np.abs(np.diff(steps, prepend=0.0)).max()
+    assert np.abs(np.diff(ramps)).max() <= most / 200 * (1 + 1e-9)
+    assert (values({**fields, "ramp_s": 0.0}, ticks) == steps).all()
+    low, high = signal(**fields, ramp_s=0.2).reach(0.0)
+    assert low <= 0.0 <= high
+
+
+def test_a_ramp_is_not_longer_than_the_time_between_draws():
+    why = refusal(type="uniform", low=0, high=1, every_s=0.1, ramp_s=0.2)
+    assert "ramp_s 0.2 must be at most every_s 0.1" in why
+
+
+@pytest.mark.parametrize("correlation_s", [0.02, 0.1, 1.0])
+def test_band_limited_noise_has_its_spread_and_correlation(correlation_s):
+    lag = round(correlation_s / DT_S)
+    ticks = range(0, 3000 * lag, max(1, lag // 10))
+    fields = {"type": "band_limited", "std": 2.0, "correlation_s": correlation_s, "mean": 7.0}
+    out = values(fields, ticks) - 7.0
+    assert out.std() == pytest.approx(2.0, rel=0.05)
+    assert out.mean() == pytest.approx(0.0, abs=0.15)
+    shift = lag // max(1, lag // 10)
+    assert np.mean(out[:-shift] * out[shift:]) / np.var(out) == pytest.approx(1 / math.e, abs=0.04)
+
+
+def test_band_limited_noise_is_smooth_and_has_no_power_beyond_its_band():
+    fields = {"type": "band_limited", "std": 1.0, "correlation_s": 0.2}
+    out = values(fields, range(60_000))
+    jerk = np.abs(np.diff(out, n=3)).max() / DT_S**3
+    assert jerk < 60.0 / (0.2 / 1.1847) ** 3  # sums of coefficients; a jump would give 1e9
+    power = np.abs(np.fft.rfft(out * np.hanning(len(out)))) ** 2
+    frequency = np.fft.rfftfreq(len(out), DT_S)
+    assert power[frequency > 2 * 0.66 / 0.2].sum() < 1e-3 * power.sum()
+
+
+def test_a_random_phase_is_drawn_once_for_each_robot_and_episode():
+    fields = {"type": "sine", "amplitude": 1.0, "frequency_hz": 1.0, "random_phase": True}
+    ticks = range(1000)
+    one = values(fields, ticks)
+    assert (values(fields, ticks) == one).all()
+    phases = []
+    for robot, episode in ((0, 1), (1, 0), (2, 0)):
+        other = values(fields, ticks, robot=robot, episode=episode)
+        assert np.abs(other - one).max() > 0.01
+        assert np.ptp(other) == pytest.approx(2.0, abs=1e-3)
+    for robot in range(400):
+        start, quarter = values(fields, (0, 250), robot=robot)
+        phases.append(math.atan2(start, quarter))
+    assert np.abs(np.mean(np.exp(1j * np.array(phases)))) < 0.15  # evenly around the circle

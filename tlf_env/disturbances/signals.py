@@ -7,22 +7,27 @@ from typing import Annotated, Literal, NamedTuple, Self
 
 from pydantic import Field, model_validator
 
-from tlf_env.common.models import Frozen, NonNegative, Number, Positive
+from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.philox import normal_pair, unit, words
 
-CONSTANT, STEP, IMPULSE, SINE, UNIFORM, GAUSSIAN, ORNSTEIN_UHLENBECK = range(7)
+CONSTANT, STEP, IMPULSE, SINE, UNIFORM, GAUSSIAN, ORNSTEIN_UHLENBECK, BAND_LIMITED = range(8)
+# Of a cubic B-spline with independent coefficients of unit variance: the standard deviation, and the lag at
+# which its autocorrelation (a B-spline of degree 7) is 1/e, in distances between coefficients.
+SPLINE_STD = math.sqrt(151.0 / 315.0)
+SPLINE_CORRELATION = 1.1847
 TAILS = 4.0  # standard deviations that count as reachable when a range is checked
 
 
 class SignalRow(NamedTuple):
-    """A signal as the compiled law takes it; what a to d mean depends on the kind."""
+    """A signal as the compiled law takes it; what the numbers mean depends on the kind."""
 
     kind: float
     a: float
     b: float
     c: float
     every: float  # ticks between draws; 0: one draw per episode
+    d: float = 0.0
 
 
 def _or(value: float | None, nominal: float) -> float:
@@ -103,18 +108,23 @@ class Impulse(_Signal):
 
 
 class Sine(_Signal):
-    """``mean`` + ``amplitude`` · sin(2π ``frequency_hz`` t + ``phase_rad``)."""
+    """``mean`` + ``amplitude`` · sin(2π ``frequency_hz`` t + ``phase_rad``).
+
+    With ``random_phase`` a phase is drawn for each robot and episode, and added.
+    """
 
     type: Literal["sine"] = "sine"
     amplitude: Number
     frequency_hz: Positive
     phase_rad: Number = 0.0
+    random_phase: Switch = False
     mean: Number | None = None  # None: the channel's nominal value
 
     def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
-        """See :class:`SignalRow`; the mean travels in ``every``."""
+        """See :class:`SignalRow`; the mean travels in ``every``, and ``d`` is 1 for a random phase."""
         rate = 2 * math.pi * self.frequency_hz
-        return SignalRow(SINE, self.amplitude, rate, self.phase_rad, _or(self.mean, nominal))
+        mean = _or(self.mean, nominal)
+        return SignalRow(SINE, self.amplitude, rate, self.phase_rad, mean, float(self.random_phase))
 
     def reach(self, nominal: float = 0.0) -> tuple[float, float]:
         """Mean ± amplitude."""
@@ -124,14 +134,27 @@ class Sine(_Signal):
 
 class _Drawn(_Signal):
     every_s: Positive | None = None  # None: one draw for the whole episode
+    ramp_s: NonNegative = (
+        0.0  # the value gets evenly to a new draw in this time; first from nominal
+    )
+
+    @model_validator(mode="after")
+    def _check_ramp(self) -> Self:
+        if self.every_s is not None and self.ramp_s > self.every_s:
+            raise ValueError(f"ramp_s {self.ramp_s} must be at most every_s {self.every_s}")
+        return self
 
     def is_steady(self) -> bool:
-        """If there is one draw per episode."""
-        return self.every_s is None
+        """If there is one draw per episode, without a ramp."""
+        return self.every_s is None and self.ramp_s == 0.0
 
     def ticks(self, dt_s: float) -> float:
         """Ticks between draws, 0 for one draw per episode, at least 1."""
         return 0.0 if self.every_s is None else float(max(1, round(self.every_s / dt_s)))
+
+    def with_ramp(self, low: float, high: float, nominal: float) -> tuple[float, float]:
+        """The range of draws, with the nominal value if a ramp begins there."""
+        return (min(low, nominal), max(high, nominal)) if self.ramp_s else (low, high)
 
 
 class Uniform(_Drawn):
@@ -149,11 +172,12 @@ class Uniform(_Drawn):
 
     def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
-        return SignalRow(UNIFORM, self.low, self.high - self.low, 0.0, self.ticks(dt_s))
+        width, ramp = self.high - self.low, self.ramp_s / dt_s
+        return SignalRow(UNIFORM, self.low, width, ramp, self.ticks(dt_s), nominal)
 
     def reach(self, nominal: float = 0.0) -> tuple[float, float]:
-        """The two ends."""
-        return self.low, self.high
+        """The two ends; and the nominal value, from which the first ramp begins."""
+        return self.with_ramp(self.low, self.high, nominal)
 
 
 class Gaussian(_Drawn):
@@ -165,12 +189,13 @@ class Gaussian(_Drawn):
 
     def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
         """See :class:`SignalRow`."""
-        return SignalRow(GAUSSIAN, _or(self.mean, nominal), self.std, 0.0, self.ticks(dt_s))
+        mean, ramp = _or(self.mean, nominal), self.ramp_s / dt_s
+        return SignalRow(GAUSSIAN, mean, self.std, ramp, self.ticks(dt_s), nominal)
 
     def reach(self, nominal: float = 0.0) -> tuple[float, float]:
-        """Mean ± 4 standard deviations."""
+        """Mean ± 4 standard deviations; and the nominal value, from which the first ramp begins."""
         mean = _or(self.mean, nominal)
-        return mean - TAILS * self.std, mean + TAILS * self.std
+        return self.with_ramp(mean - TAILS * self.std, mean + TAILS * self.std, nominal)
 
 
 class OrnsteinUhlenbeck(_Signal):
@@ -197,19 +222,75 @@ class OrnsteinUhlenbeck(_Signal):
         return mean - TAILS * self.std, mean + TAILS * self.std
 
 
+class BandLimited(_Signal):
+    """Smooth Gaussian noise: its autocorrelation falls to 1/e after ``correlation_s``.
+
+    A cubic B-spline whose coefficients are drawn at equal distances, so it has continuous derivatives up to
+    the second. Half of the power density at 0 Hz is left at 0.27/``correlation_s``, 1 % at
+    0.66/``correlation_s``.
+    """
+
+    type: Literal["band_limited"] = "band_limited"
+    std: NonNegative
+    correlation_s: Positive
+    mean: Number | None = None  # None: the channel's nominal value
+
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
+        """See :class:`SignalRow`; ``every`` are the ticks between two coefficients, no whole number."""
+        ticks = self.correlation_s / (SPLINE_CORRELATION * dt_s)
+        return SignalRow(
+            BAND_LIMITED, _or(self.mean, nominal), self.std / SPLINE_STD, 0.0, max(ticks, 1.0)
+        )
+
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
+        """Mean ± 4 standard deviations."""
+        mean = _or(self.mean, nominal)
+        return mean - TAILS * self.std, mean + TAILS * self.std
+
+
 Signal = Annotated[
-    Constant | Step | Impulse | Sine | Uniform | Gaussian | OrnsteinUhlenbeck,
+    Constant | Step | Impulse | Sine | Uniform | Gaussian | OrnsteinUhlenbeck | BandLimited,
     Field(discriminator="type"),
 ]
 
 
 @law
-def is_due(kind: float, every: float, tick: int, ticks: int) -> bool:
+def is_due(row: SignalRow, tick: int, ticks: int) -> bool:
     """Whether a signal may have another value than it had ``ticks`` before."""
-    if kind != UNIFORM and kind != GAUSSIAN:
-        return kind != CONSTANT
-    between = int(every)
+    if row.kind != UNIFORM and row.kind != GAUSSIAN:
+        return row.kind != CONSTANT
+    between = int(row.every)
+    since = tick % between if between > 0 else tick
+    if row.c > 0.0 and since < row.c + ticks:
+        return True
     return between > 0 and tick // between != (tick - ticks) // between
+
+
+@law
+def random_draw(
+    row: SignalRow, index: int, seed: int, channel: int, robot: int, episode: int
+) -> float:
+    """The draw number ``index`` of a uniform or Gaussian signal."""
+    if row.kind == UNIFORM:
+        word, _, _, _ = words(seed, channel, robot, episode, index)
+        return row.a + row.b * unit(word)
+    drawn, _ = normal_pair(seed, channel, robot, episode, index)
+    return row.a + row.b * drawn
+
+
+@law
+def spline_noise(position: float, seed: int, channel: int, robot: int, episode: int) -> float:
+    """Cubic B-spline with standard normal coefficients, at a position in distances between them."""
+    first = int(position)
+    u = position - first
+    v = 1.0 - u
+    c_0, _ = normal_pair(seed, channel, robot, episode, first)
+    c_1, _ = normal_pair(seed, channel, robot, episode, first + 1)
+    c_2, _ = normal_pair(seed, channel, robot, episode, first + 2)
+    c_3, _ = normal_pair(seed, channel, robot, episode, first + 3)
+    w_1 = 4.0 - 3.0 * u * u * (2.0 - u)
+    w_2 = 4.0 - 3.0 * v * v * (2.0 - v)
+    return (v * v * v * c_0 + w_1 * c_1 + w_2 * c_2 + u * u * u * c_3) / 6.0
 
 
 @law
@@ -233,7 +314,14 @@ def signal_value(
     if kind == IMPULSE:
         return (row.a if row.b <= time < row.b + row.every else row.c), memory
     if kind == SINE:
-        return row.every + row.a * math.sin(row.b * time + row.c), memory
+        phase = row.c
+        if row.d > 0.0:
+            word, _, _, _ = words(seed, channel, robot, episode, 0)
+            phase += 2.0 * math.pi * unit(word)
+        return row.every + row.a * math.sin(row.b * time + phase), memory
+    if kind == BAND_LIMITED:
+        noise = spline_noise(tick / row.every, seed, channel, robot, episode)
+        return row.a + row.b * noise, memory
     if kind == ORNSTEIN_UHLENBECK:
         drawn, _ = normal_pair(seed, channel, robot, episode, tick)
         if tick == 0:
@@ -242,8 +330,11 @@ def signal_value(
             memory = row.c * memory + math.sqrt(1.0 - row.c * row.c) * drawn
         return row.a + row.b * memory, memory
     index = tick // int(row.every) if row.every > 0.0 else 0
-    if kind == UNIFORM:
-        word, _, _, _ = words(seed, channel, robot, episode, index)
-        return row.a + row.b * unit(word), memory
-    drawn, _ = normal_pair(seed, channel, robot, episode, index)
-    return row.a + row.b * drawn, memory
+    value = random_draw(row, index, seed, channel, robot, episode)
+    since = tick - index * int(row.every)
+    if since < row.c:
+        before = row.d
+        if index > 0:
+            before = random_draw(row, index - 1, seed, channel, robot, episode)
+        value = before + since / row.c * (value - before)
+    return value, memory

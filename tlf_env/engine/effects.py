@@ -25,6 +25,12 @@ HIGHS = np.array([one.high for one in CHANNELS])
 OF_SUBSTEPS, OF_STEPS = numbers(SUBSTEP), numbers(CONTROL_STEP)
 
 
+@law
+def signal_row(signal: np.ndarray) -> SignalRow:
+    """A row of ``Arrays.signals``."""
+    return SignalRow(signal[0], signal[1], signal[2], signal[3], signal[4], signal[5])
+
+
 @block
 def evaluate(
     arrays: Arrays, lane: int, robot: int, channel: int, tick: int, settings: Settings
@@ -32,7 +38,7 @@ def evaluate(
     """Evaluate a channel (its place in the table) for one robot at a tick."""
     signal = arrays.signals[arrays.variants[lane], channel]
     value, arrays.processes[channel, robot, lane] = signal_value(
-        SignalRow(signal[0], signal[1], signal[2], signal[3], signal[4]),
+        signal_row(signal),
         tick,
         settings.dt,
         arrays.seeds[lane],
@@ -70,7 +76,7 @@ def refresh(
     for i in range(channels.shape[0]):
         channel = channels[i]
         signal = arrays.signals[arrays.variants[lane], channel]
-        if settings.adversary or is_due(signal[0], signal[4], tick, ticks):
+        if settings.adversary or is_due(signal_row(signal), tick, ticks):
             evaluate(arrays, lane, robot, channel, tick, settings)
             found = True
     return found
