@@ -47,7 +47,15 @@ def record(
     """Fill ``motions`` and ``contacts`` (field, substep, 1) from their first column on."""
     robot = read_body(bodies, 0, 0)
     for k in range(torques.shape[0]):
-        floor = Floor(floors[k, 0], floors[k, 1], floors[k, 2], floors[k, 3], floors[k, 4])
+        floor = Floor(
+            floors[k, 0],
+            floors[k, 1],
+            floors[k, 2],
+            floors[k, 3],
+            floors[k, 4],
+            floors[k, 5],
+            floors[k, 6],
+        )
         push = Push(pushes[k, 0], pushes[k, 1], pushes[k, 2])
         motion, contact = substep(
             robot,

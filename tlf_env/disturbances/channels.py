@@ -76,6 +76,20 @@ CHANNELS = (
     Channel("payload.inertia_kg_mm2", 116, EPISODE, 0.0, (0.0, 1e7), "its inertia about its own centre"),
     Channel("start.position_std_mm", 117, EPISODE, 0.0, (0.0, 1e4), "scatter of the starts, per coordinate"),
     Channel("start.heading_std_rad", 118, EPISODE, 0.0, (0.0, 10.0), "scatter of the start headings"),
+    Channel("slip.left_mm_s", 119, SUBSTEP, 0.0, (-2000.0, 2000.0), "slip added under the left wheel"),
+    Channel("slip.right_mm_s", 120, SUBSTEP, 0.0, (-2000.0, 2000.0), "slip added under the right wheel"),
+    Channel("tyre.friction_left", 121, SUBSTEP, 1.0, (0.0, 100.0), "factor on the left drive tyre"),
+    Channel("tyre.friction_right", 122, SUBSTEP, 1.0, (0.0, 100.0), "factor on the right drive tyre"),
+    Channel("tyre.creep", 123, SUBSTEP, 0.0, (0.0, 10.0), "slip ratio per force over load, below the limit"),
+    Channel("floor.rolling_resistance", 124, SUBSTEP, 0.0, (0.0, 1.0), "resisting force over load, each wheel"),
+    Channel("floor.slope_rad", 125, SUBSTEP, 0.0, (-0.7, 0.7), "slope of the floor"),
+    Channel("floor.uphill_rad", 126, SUBSTEP, 0.0, (-10.0, 10.0), "direction in which it rises, from +y"),
+    Channel("push.x_N", 127, SUBSTEP, 0.0, (-1000.0, 1000.0), "force at the centre of mass, x"),
+    Channel("push.y_N", 128, SUBSTEP, 0.0, (-1000.0, 1000.0), "force at the centre of mass, y"),
+    Channel("push.torque_Nmm", 129, SUBSTEP, 0.0, (-1e5, 1e5), "torque about the centre of mass"),
+    Channel("actuator.back_emf_s_rad", 130, SUBSTEP, 0.0, (0.0, 1.0), "share of torque lost per rad/s"),
+    Channel("actuator.dead_band_Nmm", 131, SUBSTEP, 0.0, (0.0, 1000.0), "smaller torques are not delivered"),
+    Channel("actuator.current_limit", 132, SUBSTEP, 1.0, (0.0, 10.0), "factor on the torque limit delivered"),
 )  # fmt: skip
 
 
@@ -92,6 +106,20 @@ class Effects(NamedTuple):
     encoder_quantum_rad: float
     actuator_torque_gain_l: float
     actuator_torque_gain_r: float
+    slip_left_mm_s: float
+    slip_right_mm_s: float
+    tyre_friction_left: float
+    tyre_friction_right: float
+    tyre_creep: float
+    floor_rolling_resistance: float
+    floor_slope_rad: float
+    floor_uphill_rad: float
+    push_x_N: float
+    push_y_N: float
+    push_torque_Nmm: float
+    actuator_back_emf_s_rad: float
+    actuator_dead_band_Nmm: float
+    actuator_current_limit: float
 
 
 PATHS = tuple(channel.path for channel in CHANNELS)

@@ -42,13 +42,34 @@ class SlipChannels(Frozen):
 
     delta_1_mm_s: ChannelSignal = _nominal("slip.delta_1_mm_s")
     delta_2_rad_s: ChannelSignal = _nominal("slip.delta_2_rad_s")
+    left_mm_s: ChannelSignal = _nominal("slip.left_mm_s")
+    right_mm_s: ChannelSignal = _nominal("slip.right_mm_s")
 
 
 class TyreChannels(Frozen):
     """Friction of the tyres, everywhere and on patches of the floor."""
 
     friction_scale: ChannelSignal = _nominal("tyre.friction_scale")
+    friction_left: ChannelSignal = _nominal("tyre.friction_left")
+    friction_right: ChannelSignal = _nominal("tyre.friction_right")
+    creep: ChannelSignal = _nominal("tyre.creep")
     patches: tuple[Patch, ...] = ()
+
+
+class FloorChannels(Frozen):
+    """The floor: its slope, and the resistance to rolling on it."""
+
+    rolling_resistance: ChannelSignal = _nominal("floor.rolling_resistance")
+    slope_rad: ChannelSignal = _nominal("floor.slope_rad")
+    uphill_rad: ChannelSignal = _nominal("floor.uphill_rad")
+
+
+class PushChannels(Frozen):
+    """Forces from outside, in world axes."""
+
+    x_N: ChannelSignal = _nominal("push.x_N")
+    y_N: ChannelSignal = _nominal("push.y_N")
+    torque_Nmm: ChannelSignal = _nominal("push.torque_Nmm")
 
 
 class PositionChannels(Frozen):
@@ -73,6 +94,9 @@ class ActuatorChannels(Frozen):
     torque_gain_r: ChannelSignal = _nominal("actuator.torque_gain_r")
     dead_time_s: ChannelSignal = _nominal("actuator.dead_time_s")
     computing_delay_s: ChannelSignal = _nominal("actuator.computing_delay_s")
+    back_emf_s_rad: ChannelSignal = _nominal("actuator.back_emf_s_rad")
+    dead_band_Nmm: ChannelSignal = _nominal("actuator.dead_band_Nmm")
+    current_limit: ChannelSignal = _nominal("actuator.current_limit")
 
 
 class RadioChannels(Frozen):
@@ -104,6 +128,8 @@ class Disturbance(Frozen):
     level: NonNegative = 1.0
     slip: SlipChannels = SlipChannels()
     tyre: TyreChannels = TyreChannels()
+    floor: FloorChannels = FloorChannels()
+    push: PushChannels = PushChannels()
     position: PositionChannels = PositionChannels()
     encoder: EncoderChannels = EncoderChannels()
     actuator: ActuatorChannels = ActuatorChannels()

@@ -14,8 +14,11 @@ from tlf_env.disturbances.channels import CHANNELS, Channel
 # Endings of a name, the longest first, and their units.
 UNITS = {
     "_kg_mm2": "kg·mm²",
+    "_s_rad": "s/rad",
     "_rad_s": "rad/s",
     "_mm_s": "mm/s",
+    "_Nmm": "N·mm",
+    "_N": "N",
     "_rad": "rad",
     "_mm": "mm",
     "_kg": "kg",

@@ -20,7 +20,7 @@ from tlf_env.numerics.rows import reader, row_reader, row_writer, writer
 from tlf_env.onboard.estimator import Ekf, Estimate
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
 from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState
-from tlf_env.physics.vehicle import Body, Contact, Motion
+from tlf_env.physics.vehicle import Body, Contact, Motion, Push
 
 
 class Sensors(NamedTuple):
@@ -165,6 +165,7 @@ ROWS = (
     Row("sample", Sample, Kind.SCRATCH),
     Row("order", Order, Kind.SCRATCH),
     Row("traction", Traction, Kind.SCRATCH),
+    Row("push", Push, Kind.SCRATCH),
     Row("reading", Reading, Kind.SCRATCH),
     Row("moved", Motion, Kind.SCRATCH),  # as the plant leaves it, before the pose is advanced
     Row("impulses", Contact, Kind.SCRATCH),

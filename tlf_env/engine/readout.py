@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -59,12 +60,17 @@ def info_of(arrays: Arrays, key: str) -> np.ndarray:
     return flags[key]
 
 
-def info_rows(arrays: Arrays, lane: int = 0) -> list[tuple[float, ...]]:
-    """The infos of a formation's robots, each a tuple in the order of ``INFO_KEYS``."""
+def info_rows(
+    arrays: Arrays, lane: int = 0, channels: Sequence[int] | slice = slice(None)
+) -> list[tuple[float, ...]]:
+    """The infos of a formation's robots, each a tuple in the order of ``INFO_KEYS``.
+
+    Of the channels only those at the given places.
+    """
     rows = zip(
         arrays.infos[lane].tolist(),
         arrays.terms[lane].tolist(),
-        arrays.applied[:, :, lane].T.tolist(),
+        arrays.applied[channels, :, lane].T.tolist(),
         arrays.lost[lane].tolist(),
         arrays.touched[lane].tolist(),
         arrays.touched_by[lane].tolist(),

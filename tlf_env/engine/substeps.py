@@ -6,12 +6,15 @@ Wheel loop → torques → disturbances → plant → sensors → EKF; :mod:`tlf
 
 from __future__ import annotations
 
+import math
+
 from tlf_env.disturbances.channels import Effects
 from tlf_env.engine.layout import Order, Sensors, Trace, Traction
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.rows import replacing
 from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState, wheel_torque
-from tlf_env.physics.vehicle import Body, Contact, Floor, Motion, conveyor
+from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.vehicle import Body, Contact, Floor, Motion, Push, conveyor
 from tlf_env.task.actions import TORQUE
 
 # Replaces the kind of action of a robot whose wheel loop is an object in Python.
@@ -65,8 +68,8 @@ def undisturbed(commanded_l: float, commanded_r: float, effects: Effects) -> Tra
         commanded_r=commanded_r,
         delivered_l=commanded_l * effects.actuator_torque_gain_l,
         delivered_r=commanded_r * effects.actuator_torque_gain_r,
-        grip_l=effects.tyre_friction_scale,
-        grip_r=effects.tyre_friction_scale,
+        grip_l=effects.tyre_friction_scale * effects.tyre_friction_left,
+        grip_r=effects.tyre_friction_scale * effects.tyre_friction_right,
         grip_c=effects.tyre_friction_scale,
     )
 
@@ -75,7 +78,42 @@ def undisturbed(commanded_l: float, commanded_r: float, effects: Effects) -> Tra
 def floor_under(body: Body, effects: Effects, traction: Traction) -> Floor:
     """Injected slip and friction of the floor under a robot during one substep."""
     belt_l, belt_r = conveyor(effects.slip_delta_1_mm_s, effects.slip_delta_2_rad_s, body.h)
-    return Floor(belt_l, belt_r, traction.grip_l, traction.grip_r, traction.grip_c)
+    return Floor(
+        conveyor_l=belt_l + effects.slip_left_mm_s,
+        conveyor_r=belt_r + effects.slip_right_mm_s,
+        grip_l=traction.grip_l,
+        grip_r=traction.grip_r,
+        grip_c=traction.grip_c,
+        rolling=effects.floor_rolling_resistance,
+        creep=effects.tyre_creep,
+    )
+
+
+@law
+def push_on(body: Body, effects: Effects) -> Push:
+    """Force from outside and the pull of gravity down a slope, in mN and mN·mm."""
+    down = body.m * body.gravity * math.sin(effects.floor_slope_rad)
+    return Push(
+        f_x=effects.push_x_N * MILLINEWTON_PER_NEWTON + down * math.sin(effects.floor_uphill_rad),
+        f_y=effects.push_y_N * MILLINEWTON_PER_NEWTON - down * math.cos(effects.floor_uphill_rad),
+        torque=effects.push_torque_Nmm * MILLINEWTON_PER_NEWTON,
+    )
+
+
+@law
+def motor_torque(torque: float, omega: float, limit: float, effects: Effects) -> float:
+    """What a motor delivers of a torque: its current limit, its torque–speed curve and its dead band.
+
+    Driving, the back-EMF leaves limit·(1 − k·|ω|); braking it does not limit.
+    """
+    if abs(torque) <= effects.actuator_dead_band_Nmm * MILLINEWTON_PER_NEWTON:
+        return 0.0
+    driving = math.copysign(omega, omega * torque)
+    share = min(
+        max(1.0 - effects.actuator_back_emf_s_rad * driving, 0.0), effects.actuator_current_limit
+    )
+    most = limit * share
+    return min(max(torque, -most), most)
 
 
 @law

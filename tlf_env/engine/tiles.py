@@ -13,8 +13,11 @@ not depend on what else is in its tile. A last tile that is not full repeats its
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
+from tlf_env.disturbances.channels import effects_of_group
 from tlf_env.disturbances.model import wheel_factors
 from tlf_env.engine.arrays import Arrays, read_command, read_wanted_before
 from tlf_env.engine.effects import OF_SUBSTEPS, delays, refresh
@@ -44,6 +47,8 @@ from tlf_env.engine.substeps import (
     EXTERNAL_TORQUE,
     commanded_torques,
     floor_under,
+    motor_torque,
+    push_on,
     trace_drive,
     undisturbed,
     wanted,
@@ -55,7 +60,18 @@ from tlf_env.physics.vehicle import Push, advance_pose, follow_wheels, roll, sli
 from tlf_env.task.actions import TORQUE
 
 WIDTH = 8  # robots in a tile: doubles in the widest vectors there are
-NO_PUSH = Push(0.0, 0.0, 0.0)
+# Places of the effects that pull at a robot, or limit its motors, and their values where they do not.
+PULLING = np.array(
+    [in_tile("effects", name) for name in [*effects_of_group("push"), "floor_slope_rad"]]
+)
+LIMITING = np.array(
+    [
+        in_tile("effects", f"actuator_{name}")
+        for name in ("back_emf_s_rad", "dead_band_Nmm", "current_limit")
+    ]
+)
+NOT_PULLING = np.zeros(len(PULLING))
+NOT_LIMITING = np.array([0.0, 0.0, 1.0])
 
 body_of = tile_reader("body")
 loop_of = tile_reader("wheel_loop")
@@ -72,6 +88,7 @@ trace_of, set_trace = tile_access("trace")
 set_sample = tile_writer("sample")
 order_of, set_order = tile_access("order")
 traction_of, set_traction = tile_access("traction")
+push_of, set_push = tile_access("push")
 reading_of, set_reading = tile_access("reading")
 moved_of, set_moved = tile_access("moved")
 impulses_of, set_impulses = tile_access("impulses")
@@ -215,6 +232,43 @@ def meet_patches(
 
 
 @law
+def differ(tile: np.ndarray, rows: np.ndarray, values: np.ndarray) -> bool:
+    """Whether one of some rows of the tile has another value than given, for some robot."""
+    found = False
+    for f in range(rows.shape[0]):
+        for i in range(WIDTH):
+            found |= tile[rows[f], i] != values[f]
+    return found
+
+
+@block
+def limit_motors(tile: np.ndarray, count: int) -> None:
+    """Deliver what the motors can."""
+    for i in range(count):
+        body, effects, traction = body_of(tile, i), effects_of(tile, i), traction_of(tile, i)
+        motion = motion_of(tile, i)
+        delivered_l = motor_torque(traction.delivered_l, motion.omega_l, body.torque_limit, effects)
+        delivered_r = motor_torque(traction.delivered_r, motion.omega_r, body.torque_limit, effects)
+        set_traction(tile, i, with_delivered(traction, delivered_l, delivered_r))
+
+
+@block
+def pull(tile: np.ndarray, count: int) -> None:
+    """Pushes and slopes; on a slope, the floor carries less."""
+    for i in range(count):
+        effects, traction = effects_of(tile, i), traction_of(tile, i)
+        set_push(tile, i, push_on(body_of(tile, i), effects))
+        share = math.cos(effects.floor_slope_rad)
+        set_traction(
+            tile,
+            i,
+            with_grip(
+                traction, traction.grip_l * share, traction.grip_r * share, traction.grip_c * share
+            ),
+        )
+
+
+@law
 def follow(tile: np.ndarray, substep: int, dt: float) -> None:
     """The ``kinematic`` plant."""
     for i in range(WIDTH):
@@ -225,8 +279,9 @@ def follow(tile: np.ndarray, substep: int, dt: float) -> None:
             motion_of(tile, i),
             wanted_l,
             wanted_r,
-            effects.slip_delta_1_mm_s,
-            effects.slip_delta_2_rad_s,
+            effects.slip_delta_1_mm_s + 0.5 * (effects.slip_left_mm_s + effects.slip_right_mm_s),
+            effects.slip_delta_2_rad_s
+            + (effects.slip_right_mm_s - effects.slip_left_mm_s) / (2.0 * body_of(tile, i).h),
             dt,
         )
         set_motion(tile, i, motion)
@@ -258,7 +313,7 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
             motion_of(tile, i),
             contact_of(tile, i),
             floor_under(body, effects_of(tile, i), traction),
-            NO_PUSH,
+            push_of(tile, i),
             traction.delivered_l,
             traction.delivered_r,
             dt,
@@ -274,7 +329,7 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
                 motion_of(tile, i),
                 contact_of(tile, i),
                 floor_under(body, effects_of(tile, i), traction),
-                NO_PUSH,
+                push_of(tile, i),
                 traction.delivered_l,
                 traction.delivered_r,
                 dt,
@@ -294,22 +349,12 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
 
 
 @law
-def encoders_disturbed(tile: np.ndarray) -> bool:
-    """Whether a channel of the encoders is off its nominal value for some robot."""
-    found = False
-    for f in range(ENCODER_EFFECTS.shape[0]):
-        for i in range(WIDTH):
-            found |= tile[ENCODER_EFFECTS[f], i] != NOMINAL_ENCODERS[f]
-    return found
-
-
-@law
 def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> None:
     """Encoders, position fixes and estimators, one tick on."""
     numbers = whole(tile)
     for i in range(WIDTH):
         numbers[TICK, i] += 1
-    if encoders_disturbed(tile):
+    if differ(tile, ENCODER_EFFECTS, NOMINAL_ENCODERS):
         for i in range(WIDTH):
             reading = disturbed_encoders(
                 motion_of(tile, i), effects_of(tile, i), draw_of(numbers, i)
@@ -396,8 +441,14 @@ def advance_in(
                     ask(tile, substep)
                     if torques.shape[1] > 1:
                         delay_torques(torques, tile, count)
+                    if differ(tile, LIMITING, NOT_LIMITING):
+                        limit_motors(tile, count)
                     if patches.shape[1] > 0:
                         meet_patches(patches, variants, lanes_in_all, tile, count)
+                    for i in range(WIDTH):
+                        set_push(tile, i, Push(0.0, 0.0, 0.0))
+                    if differ(tile, PULLING, NOT_PULLING):
+                        pull(tile, count)
                     move(tile, count, settings.dt)
             if senses:
                 sense_tile(tile, substep, settings.estimator, settings.dt)

@@ -15,6 +15,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from tlf_env.common.errors import shown
+from tlf_env.disturbances.channels import CHANNELS
 from tlf_env.disturbances.model import PatchRow, patch_rows
 from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, state_dtype
 from tlf_env.engine.judging import TERMINATES, TRUNCATES
@@ -105,6 +106,16 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self.possible_agents = [f"robot_{i}" for i in range(self.scenario.robot_count)]
         self.agents: list[Agent] = []
         self._formation = Formation(self.scenario, parts)
+        # Channels that stay for a whole episode are taken from its first infos.
+        self._varying = [
+            i
+            for i, channel in enumerate(CHANNELS)
+            if self.scenario.adversary
+            or not self.scenario.disturbance.signal(channel.path).is_steady()
+        ]
+        steady = {one.key for i, one in enumerate(CHANNELS) if i not in self._varying}
+        self._varying_keys = [key for key in INFO_KEYS if key not in steady]
+        self._first_infos: list[dict[str, Any]] = []
         dtype = np.dtype(self.scenario.dtype)
         self.observation_spaces = {
             agent: gymnasium.spaces.Box(
@@ -292,14 +303,22 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return dict(zip(self.possible_agents, fresh, strict=True))
 
     def _infos(self) -> dict[Agent, dict[str, Any]]:
-        keys, pick = self._info_keys, self._pick
+        keys, pick, arrays = self._info_keys, self._pick, self._formation.arrays
         if not keys:
             return {agent: {} for agent in self.possible_agents}
-        rows: Sequence[Sequence[float]] = info_rows(self._formation.arrays)
+        if self._formation.step_count and len(keys) == len(INFO_KEYS):
+            changed = info_rows(arrays, channels=self._varying)
+            named = [
+                first | dict(zip(self._varying_keys, row, strict=True))
+                for first, row in zip(self._first_infos, changed, strict=True)
+            ]
+            return dict(zip(self.possible_agents, named, strict=True))
+        rows: Sequence[Sequence[float]] = info_rows(arrays)
         if len(keys) < len(INFO_KEYS):
             rows = [[row[i] for i in pick] for row in rows]
         named = [dict(zip(keys, row, strict=True)) for row in rows]
-        return dict(zip(self.possible_agents, named, strict=True))
+        self._first_infos = named
+        return dict(zip(self.possible_agents, [one.copy() for one in named], strict=True))
 
     def state(self) -> np.ndarray:
         """The true state for critics: scaled :class:`tlf_env.task.info.State` of every robot.

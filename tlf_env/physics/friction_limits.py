@@ -21,6 +21,15 @@ class FrictionLimits(NamedTuple):
     axle_r: float
     axle_c: float
     steering: float
+    creep_l: float  # compliance of a tyre below its limit: slip per impulse, mm/s per mN·s
+    creep_r: float
+    creep_c: float
+
+
+@law
+def creep(floor: Floor, speed: float, load: float, dt: float) -> float:
+    """Compliance of a tyre that rolls at a speed (mm/s): slip = creep·|speed|·force/load."""
+    return floor.creep * abs(speed) / (load * dt)
 
 
 @law
@@ -88,13 +97,25 @@ def steering_axle(body: Body, phi_rate: float, p_x: float, p_y: float, dt: float
 def friction_limits(
     body: Body, motion: Motion, contact: Contact, floor: Floor, dt: float
 ) -> FrictionLimits:
-    """All limits of a substep, from the speeds at its start and the previous impulses."""
+    """All limits of a substep, from the speeds at its start and the previous impulses.
+
+    Resistance to rolling is a torque on the axle that opposes its spin: coefficient·load·radius.
+    """
+    rolling = floor.rolling * dt
+    spin_l, spin_r = body.R * motion.omega_l, body.R * motion.omega_r
+    spin_c = body.R_c * motion.omega_c
     return FrictionLimits(
         grip_l=grip(body, body.load_drive, floor.grip_l, contact.slip_l, dt),
         grip_r=grip(body, body.load_drive, floor.grip_r, contact.slip_r, dt),
         grip_c=grip(body, body.load_castor, floor.grip_c, contact.slip_c, dt),
-        axle_l=drive_axle(body, motion.omega_l, contact.p_le, contact.p_lf, dt),
-        axle_r=drive_axle(body, motion.omega_r, contact.p_re, contact.p_rf, dt),
-        axle_c=castor_axle(body, motion.omega_c, contact.p_cx, contact.p_cy, dt),
+        axle_l=drive_axle(body, motion.omega_l, contact.p_le, contact.p_lf, dt)
+        + rolling * body.load_drive * body.R,
+        axle_r=drive_axle(body, motion.omega_r, contact.p_re, contact.p_rf, dt)
+        + rolling * body.load_drive * body.R,
+        axle_c=castor_axle(body, motion.omega_c, contact.p_cx, contact.p_cy, dt)
+        + rolling * body.load_castor * body.R_c,
         steering=steering_axle(body, motion.s - motion.w, contact.p_cx, contact.p_cy, dt),
+        creep_l=creep(floor, spin_l, body.load_drive, dt),
+        creep_r=creep(floor, spin_r, body.load_drive, dt),
+        creep_c=creep(floor, spin_c, body.load_castor, dt),
     )

@@ -110,7 +110,7 @@ def roll(
     rolls, after, impulses = rolling(
         body, frame.free, frame.before, frame.cos_p, frame.sin_p, floor, frame.limits
     )
-    return rolls, moved(motion, frame, after, dt), impulses
+    return rolls and floor.creep == 0.0, moved(motion, frame, after, dt), impulses
 
 
 @block

@@ -86,7 +86,7 @@ def _rates(robot: Body, state: np.ndarray, torques_Nmm: np.ndarray) -> np.ndarra
         robot,
         motion,
         Contact(*(0.0,) * len(Contact._fields)),
-        Floor(0.0, 0.0, 1.0, 1.0, 1.0),
+        Floor(0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0),
         Push(0.0, 0.0, 0.0),
         torque_l,
         torque_r,

@@ -141,7 +141,7 @@ def advance_open_loop(
     body = read_body(bodies, 0, 0)
     motion = read_motion(motions, 0, 0)
     contact = read_contact(contacts, 0, 0)
-    floor = Floor(0.0, 0.0, 1.0, 1.0, 1.0)
+    floor = Floor(0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0)
     load = Push(push[0], push[1], push[2])
     for k in range(torques.shape[0]):
         motion, contact = substep(

@@ -66,6 +66,8 @@ class Floor(NamedTuple):
     grip_l: float  # factors on the tyres' friction
     grip_r: float
     grip_c: float
+    rolling: float = 0.0  # resistance to rolling: force over load
+    creep: float = 0.0  # slip ratio per force over load, of a tyre below its limit
 
 
 class Push(NamedTuple):

@@ -32,11 +32,12 @@ def drive_wheel(
     belt: float,
     friction: float,
     grip: float,
+    creep: float,
 ) -> tuple[float, float, float, float, float]:
     """Solve one drive wheel: first with a sticking axle, then with a sliding axle.
 
     ``side`` is +1 left, −1 right; ``friction`` the largest impulse of the axle, ``grip`` that of the
-    tyre. Velocities and ``omega_0`` exclude the impulses of this wheel.
+    tyre, ``creep`` its compliance below that. Velocities and ``omega_0`` exclude the impulses of this wheel.
     Returns ``(p_e, p_f, q, ω, λ)``.
     """
     b_e = v_e - w * body.d
@@ -44,7 +45,7 @@ def drive_wheel(
     w_ef = side * body.w_ef
     # Skip the sticking case if friction and tyre together cannot stop the axle in one substep.
     if body.J * abs(omega_0) <= friction + body.R * grip:
-        p_e, p_f, lam = disc(body.w_ee, body.w_ff, w_ef, b_e, b_f, grip)
+        p_e, p_f, lam = disc(body.w_ee + creep, body.w_ff + creep, w_ef, b_e, b_f, grip)
         q = body.R * p_f - body.J * omega_0
         if abs(q) <= friction:
             return p_e, p_f, q, 0.0, lam
@@ -52,9 +53,8 @@ def drive_wheel(
     else:
         q = -math.copysign(friction, omega_0)
     omega = omega_0 + q * body.inverse_J
-    p_e, p_f, lam = disc(
-        body.w_ee, body.w_ff + body.spin_drive, w_ef, b_e, b_f - body.R * omega, grip
-    )
+    w_ff = body.w_ff + body.spin_drive + creep
+    p_e, p_f, lam = disc(body.w_ee + creep, w_ff, w_ef, b_e, b_f - body.R * omega, grip)
     return p_e, p_f, q, omega - body.R * p_f * body.inverse_J, lam
 
 
@@ -69,6 +69,7 @@ def castor_wheel(
     omega_0: float,
     friction: float,
     grip: float,
+    creep: float,
 ) -> tuple[float, float, float, float, float]:
     """Solve the castor wheel for a given steering state, with the same two cases as a drive wheel.
 
@@ -76,7 +77,7 @@ def castor_wheel(
     Returns ``(p_⊥, p_∥, q_c, ω_c, λ)``.
     """
     if body.J_c * abs(omega_0) <= friction + body.R_c * grip:
-        p_x, p_y, lam = disc(w_xx, w_yy, w_xy, b_x, b_y, grip)
+        p_x, p_y, lam = disc(w_xx + creep, w_yy + creep, w_xy, b_x, b_y, grip)
         q = body.R_c * p_y - body.J_c * omega_0
         if abs(q) <= friction:
             return p_x, p_y, q, 0.0, lam
@@ -84,7 +85,8 @@ def castor_wheel(
     else:
         q = -math.copysign(friction, omega_0)
     omega = omega_0 + q * body.inverse_J_c
-    p_x, p_y, lam = disc(w_xx, w_yy + body.spin_castor, w_xy, b_x, b_y - body.R_c * omega, grip)
+    w_yy += body.spin_castor + creep
+    p_x, p_y, lam = disc(w_xx + creep, w_yy, w_xy, b_x, b_y - body.R_c * omega, grip)
     return p_x, p_y, q, omega - body.R_c * p_y * body.inverse_J_c, lam
 
 
@@ -101,6 +103,7 @@ def castor(
     axle_friction: float,
     steer_friction: float,
     grip: float,
+    creep: float,
 ) -> tuple[float, float, float, float, float, float, float, float]:
     """Solve the castor: first with locked, then with sliding steering.
 
@@ -121,6 +124,7 @@ def castor(
         omega_0,
         axle_friction,
         grip,
+        creep,
     )
     locked = rate + (lever * p_x - across * p_y) / I_total
     q_s = body.I_s * (locked - s) - body.T * p_x
@@ -140,6 +144,7 @@ def castor(
         omega_0,
         axle_friction,
         grip,
+        creep,
     )
     w_new = w_free + (q_cos * p_x - across * p_y) * body.inverse_I
     s_new = s_free + body.T * p_x * body.inverse_I_s
@@ -198,7 +203,16 @@ def sweep(
         v_f -= p_lf * body.inverse_m
         w += (body.h * p_lf + body.d * p_le) * body.inverse_I
         p_le, p_lf, q_l, omega_l, lam_l = drive_wheel(
-            body, 1.0, v_e, v_f, w, free.omega_l, floor.conveyor_l, limits.axle_l, limits.grip_l
+            body,
+            1.0,
+            v_e,
+            v_f,
+            w,
+            free.omega_l,
+            floor.conveyor_l,
+            limits.axle_l,
+            limits.grip_l,
+            limits.creep_l,
         )
         v_e += p_le * body.inverse_m
         v_f += p_lf * body.inverse_m
@@ -208,7 +222,16 @@ def sweep(
         v_f -= p_rf * body.inverse_m
         w -= (body.h * p_rf - body.d * p_re) * body.inverse_I
         p_re, p_rf, q_r, omega_r, lam_r = drive_wheel(
-            body, -1.0, v_e, v_f, w, free.omega_r, floor.conveyor_r, limits.axle_r, limits.grip_r
+            body,
+            -1.0,
+            v_e,
+            v_f,
+            w,
+            free.omega_r,
+            floor.conveyor_r,
+            limits.axle_r,
+            limits.grip_r,
+            limits.creep_r,
         )
         v_e += p_re * body.inverse_m
         v_f += p_rf * body.inverse_m
@@ -227,6 +250,7 @@ def sweep(
             limits.axle_c,
             limits.steering,
             limits.grip_c,
+            limits.creep_c,
         )
         new_e, new_f = p_cx * cos_p - p_cy * sin_p, p_cx * sin_p + p_cy * cos_p
         v_e += (new_e - p_ce) * body.inverse_m
@@ -241,7 +265,7 @@ def sweep(
         if change < SWEEP_TOLERANCE_MM_S:
             break
 
-    if lam_l == 0.0 and lam_r == 0.0:
+    if lam_l == 0.0 and lam_r == 0.0 and floor.creep == 0.0:
         p_le, p_re = share_lateral(p_le, p_lf, p_re, p_rf, limits.grip_l, limits.grip_r)
 
     side_slip = v_e - w * body.d

@@ -190,6 +190,8 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "level": 1.0,
         "slip": {},
         "tyre": {},
+        "floor": {},
+        "push": {},
         "position": {},
         "encoder": {},
         "actuator": {},
