@@ -60,10 +60,29 @@ SHOWS = {
     "payload.inertia_kg_mm2": 2000.0,
     "start.position_std_mm": 30.0,
     "start.heading_std_rad": 0.1,
+    "slip.left_mm_s": 20.0,
+    "slip.right_mm_s": 20.0,
+    "tyre.friction_left": 0.5,
+    "tyre.friction_right": 0.5,
+    "tyre.creep": 0.1,
+    "floor.rolling_resistance": 0.002,
+    "floor.slope_rad": 0.02,
+    "floor.uphill_rad": 1.0,
+    "push.x_N": 0.1,
+    "push.y_N": 0.1,
+    "push.torque_Nmm": 20.0,
+    "actuator.back_emf_s_rad": 0.05,
+    "actuator.dead_band_Nmm": 1.0,
+    "actuator.current_limit": 0.8,
 }
 
 
-NEEDS_MASS = ("payload.behind_mm", "payload.inertia_kg_mm2")
+# Channels that act only beside another.
+NEEDS = {
+    "payload.behind_mm": {"payload.mass_kg": 0.5},
+    "payload.inertia_kg_mm2": {"payload.mass_kg": 0.5},
+    "floor.uphill_rad": {"floor.slope_rad": 0.02},
+}
 
 
 def random_signal(path):

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from disturbance_helpers import (
     ANGLES,
-    NEEDS_MASS,
+    NEEDS,
     ROBOT,
     SHOWS,
     Run,
@@ -47,9 +47,9 @@ def test_at_level_0_the_run_is_bitwise_nominal(path):
 
 @pytest.mark.parametrize("path", PATHS)
 def test_away_from_nominal_the_run_changes(path):
-    with_mass = {"payload.mass_kg": 0.5} if path in NEEDS_MASS else {}
-    before = run(with_mass) if with_mass else nominal()
-    after = run({**with_mass, path: SHOWS[path]})
+    beside = NEEDS.get(path, {})
+    before = run(beside) if beside else nominal()
+    after = run({**beside, path: SHOWS[path]})
     assert (after.motion[-1] != before.motion[-1]).any()
     assert (after.applied[:, :, number(path)] == SHOWS[path]).all()
 

@@ -109,7 +109,6 @@ def test_rolling_and_sliding_robots_and_a_stuck_steering_occur():
 
 
 OF_SUBSTEPS = tuple(numbers(SUBSTEP).tolist())
-assert tuple(range(10)) == OF_SUBSTEPS  # one after the other, as `read_effects` takes them
 read_effects, write_sample = reader(Effects), writer(Sample)
 read_body, read_wheel_loop = array_reader("body"), array_reader("wheel_loop")
 read_ekf, read_slip_ekf = array_reader("ekf"), array_reader("slip_ekf")
@@ -127,6 +126,7 @@ read_command = array_reader("command")
 def one_by_one(a: Arrays, s: Settings) -> None:
     """What :func:`advance` does for wheels under twist, no dead time and no patches, without a tile."""
     push = Push(0.0, 0.0, 0.0)
+    values = np.empty((len(OF_SUBSTEPS), 1, 1))
     for lane in range(a.states.shape[2]):
         for r in range(a.states.shape[1]):
             body, loop, ekf, slip_ekf = (
@@ -142,7 +142,9 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                 if s.changing:
                     for channel in OF_SUBSTEPS:
                         evaluate(a, lane, r, channel, tick, s)
-                effects = read_effects(a.applied, r, lane)
+                for f in range(len(OF_SUBSTEPS)):
+                    values[f, 0, 0] = a.applied[OF_SUBSTEPS[f], r, lane]
+                effects = read_effects(values, 0, 0)
                 sensors = read_sensors(a.states, r, lane)
                 commanded_l, commanded_r, held = commanded_torques(
                     body, loop, order, read_loop_state(a.states, r, lane), sensors, k
