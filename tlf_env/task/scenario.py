@@ -13,6 +13,7 @@ from pydantic import (
     AfterValidator,
     Field,
     ValidationError,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -190,10 +191,14 @@ class Scenario(Frozen):
 
     @field_validator("world", mode="before")
     @classmethod
-    def _named_world(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            return read_preset_or_file("world", value, ", nor a mapping")
-        return value
+    def _named_world(cls, value: Any, info: ValidationInfo) -> Any:
+        """A preset or a file; a relative path starts at the scenario's folder or the working directory."""
+        if not isinstance(value, str | Path):
+            return value
+        beside = Path((info.context or {}).get("folder", "")) / value
+        if is_file_name(value) and beside.is_file():
+            value = beside
+        return read_preset_or_file("world", value, ", nor a mapping")
 
     @field_validator("reward", mode="before")
     @classmethod
