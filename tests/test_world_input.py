@@ -11,7 +11,8 @@ import pytest
 from baselines import cli
 from tlf_env.common.presets import preset_names, yaml_text
 from tlf_env.physics.world import World
-from tlf_env.task.scenario import load_scenario
+from tlf_env.task.feasibility import largest_push
+from tlf_env.task.scenario import load_scenario, scenario_warnings
 
 CIRCLE = {"type": "circle", "radius_mm": 10.0}
 PATH = [[0.0, 0.0], [100.0, 0.0]]
@@ -254,3 +255,22 @@ def test_a_polygon_contains_its_centre_of_mass_only_inside():
         load_scenario("infinity", world=pushable(shape={"type": "polygon", "points_mm": points}))
     with pytest.raises(ValueError, match="must contain"):
         load_scenario("infinity", world=pushable(shape={"type": "polygon", "points_mm": THREE}))
+
+
+def test_a_body_that_all_robots_together_cannot_push_is_named():
+    scenario = load_scenario("infinity", robots=3)
+    push = 3 * largest_push(scenario.robot)  # N
+    assert push == pytest.approx(3 * 0.407, rel=0.01)
+    held = push / (0.1 * scenario.robot.gravity_mm_s2 / 1000.0)  # kg
+    for share, lines in ((0.99, 0), (1.01, 1)):
+        world = pushable(mass_kg=share * held, floor_friction=0.1)
+        found = scenario_warnings(load_scenario(scenario, world=world))
+        assert (
+            len([line for line in found if "world.pushables[0] holds to the floor" in line])
+            == lines
+        )
+    world = pushable(mass_kg=1.0, floor_friction=0.5)
+    found = scenario_warnings(load_scenario(scenario, world=world))
+    assert any("with 4.9 N" in line and "push with 1.22 N" in line for line in found)
+    for name in preset_names():
+        assert not [line for line in scenario_warnings(load_scenario(name)) if "pushables" in line]

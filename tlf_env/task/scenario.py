@@ -45,6 +45,7 @@ from tlf_env.physics.world import World
 from tlf_env.task.actions import ActionKind
 from tlf_env.task.feasibility import (
     disturbed,
+    push_warnings,
     sensor_warnings,
     start_note,
     wall_warnings,
@@ -498,6 +499,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
                 scenario.trajectory, robot, scenario.world, scenario.horizon_s
             )
         ]
+    lines += push_warnings(scenario.robot_models, scenario.world)
     lines += _contact_warnings(scenario)
     if scenario.observation == "sensor":
         lines += sensor_warnings(
