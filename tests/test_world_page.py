@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 from pathlib import Path
 
 import numpy as np
+import pymunk
 import pytest
 import yaml
 
+import tlf_env
 from tlf_env.common.presets import preset_names
 from tlf_env.physics.parameters import RobotParameters
 from tlf_env.physics.world import Wall, World
@@ -95,3 +98,84 @@ def test_the_numbers_of_a_push_are_those_of_the_model():
     ).groups()
     assert float(light) == pytest.approx(push / (0.3 * gravity), abs=0.005)
     assert float(heavy) == pytest.approx(push / (0.01 * gravity), rel=0.05)
+
+
+def test_the_costs_are_measured_as_the_page_says(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "docs" / "figures")
+    make_world = importlib.import_module("make_world")
+    monkeypatch.setattr(make_world, "ROUNDS", 1)
+    monkeypatch.setattr(make_world, "STEPS", 3)
+    measured, printed = (
+        re.findall(r"^\| ([^|]*) \|[ \d.]*\|[ \d.]*\|$", text, re.M)
+        for text in (make_world.table(), PAGE)
+    )
+    assert measured == printed == list(make_world.CASES)
+    # The cases are what their names say.
+    pushing = make_world.driver(make_world.CASES["the leader pushes a box"])
+    make_world.timed(pushing)
+    assert pushing.pushable_bodies[0].velocity.y > 50.0
+
+
+# What docs/environment.md says about objects in the space
+
+
+def at_origin():
+    """One robot at the origin, towards +y."""
+    env = tlf_env.parallel_env(robots=1, disturbance="none", end_on=())
+    env.reset(seed=0, options={"poses": [[0.0, 0.0, 0.0]]})
+    return env
+
+
+def stepped(env, steps, speed=0.0):
+    """The last info after some steps."""
+    for _ in range(steps):
+        *_, infos = env.step({"robot_0": np.array([speed / 1000.0, 0.0])})
+    return infos["robot_0"]
+
+
+def test_a_force_acts_through_one_control_step_and_is_then_gone():
+    """Against the rolling robot: the momentum it takes is force times the step, while the wheels coast."""
+    env = tlf_env.parallel_env(
+        robots=1, disturbance="none", end_on=(), action="torque", robot={"joint_friction": False}
+    )
+    env.reset(seed=0, options={"poses": [[0.0, 0.0, 0.0]]})
+    body = env.robot_bodies["robot_0"]
+    body.apply_force_at_world_point((0.0, 300.0), body.position)
+    places = [stepped(env, 1)["y_mm"] for _ in range(3)]
+    assert body.force == (0.0, 0.0)
+    robot, dt = env.scenario.robot, env.scenario.control_period_s
+    mass = (
+        robot.mass_kg
+        + 2 * robot.wheel_inertia_kg_mm2 / robot.wheel_radius_mm**2
+        + robot.castor_inertia_kg_mm2 / robot.castor_radius_mm**2
+    )
+    speeds = np.diff(places) / dt
+    assert speeds == pytest.approx(300.0 * dt / mass, rel=0.03)
+
+
+def test_a_place_written_to_a_robots_body_has_no_effect():
+    env, other = at_origin(), at_origin()
+    env.robot_bodies["robot_0"].position = (500.0, 500.0)
+    env.robot_bodies["robot_0"].velocity = (500.0, 500.0)
+    assert env.robot_bodies["robot_0"].position == other.robot_bodies["robot_0"].position
+    assert stepped(env, 20, 100.0) == stepped(other, 20, 100.0)
+
+
+def test_a_static_shape_moved_by_hand_is_noticed_when_the_space_is_read():
+    env = at_origin()
+    space = env.space
+    wall = pymunk.Segment(space.static_body, (-500.0, 9000.0), (500.0, 9000.0), 5.0)
+    space.add(wall)
+    assert stepped(env, 50, 300.0)["touched_by"] == tlf_env.TouchedBy.NOTHING
+    y_mm = stepped(env, 1, 300.0)["y_mm"] + 120.0
+    wall.unsafe_set_endpoints((-500.0, y_mm), (500.0, y_mm))
+    space.reindex_shape(wall)
+    assert env.space is space
+    info = stepped(env, 50, 300.0)
+    assert info["touched_by"] == tlf_env.TouchedBy.WALL
+    assert info["y_mm"] < y_mm
+
+
+def test_new_shapes_have_no_friction_and_no_restitution():
+    shape = pymunk.Circle(pymunk.Body(1.0, 1.0), 1.0)
+    assert (shape.friction, shape.elasticity) == (0.0, 0.0)

@@ -5,7 +5,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import types
 from collections.abc import Iterable
@@ -200,9 +199,8 @@ def renewed(page: str) -> str:
         begin, end = f"<!-- {name} -->\n", f"<!-- end of {name} -->"
         if begin not in page or end not in page:
             raise ValueError(f"the page has no {begin.strip()} … {end}")
-        made = table(model, meanings)
-        pattern = f"({re.escape(begin)}).*?({re.escape(end)})"
-        page = re.sub(pattern, lambda at, made=made: at[1] + made + at[2], page, flags=re.DOTALL)
+        before, rest = page.split(begin, 1)
+        page = before + begin + table(model, meanings) + end + rest.split(end, 1)[1]
     return page
 
 
