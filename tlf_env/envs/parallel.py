@@ -159,6 +159,17 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self._formation.space  # noqa: B018 - puts the bodies at their present poses
         return dict(zip(self.possible_agents, self._formation.plant.bodies, strict=True))
 
+    @property
+    def pushable_bodies(self) -> list[pymunk.Body]:
+        """The pymunk bodies of the world's ``pushables``, in their order, where they are now."""
+        return self._formation.plant.pushable_bodies
+
+    @property
+    def moving_bodies(self) -> list[pymunk.Body]:
+        """The pymunk bodies of the world's ``moving`` obstacles, in their order, where they are now."""
+        self._formation.space  # noqa: B018 - puts the bodies where they are now
+        return self._formation.plant.moving_bodies
+
     def observation_space(self, agent: Agent) -> gymnasium.spaces.Box:
         """Space of an agent's observations; the same object at every call."""
         return self.observation_spaces[agent]

@@ -179,6 +179,16 @@ class PymunkPlant:
         ] = {}  # of a substep: robots, and the type of body that each touched
 
     @property
+    def pushable_bodies(self) -> list[pymunk.Body]:
+        """The bodies of the world's ``pushables``, in their order."""
+        return [one.body for one in self._pushed]
+
+    @property
+    def moving_bodies(self) -> list[pymunk.Body]:
+        """The bodies of the world's ``moving`` obstacles, in their order."""
+        return [mover.body for mover in self._movers]
+
+    @property
     def mover_laps_s(self) -> list[float]:
         """For each moving obstacle the time of a lap if its start is random, else 0."""
         return [mover.course.lap_s if mover.random_start else 0.0 for mover in self._movers]

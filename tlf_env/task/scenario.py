@@ -13,6 +13,7 @@ from pydantic import (
     AfterValidator,
     Field,
     ValidationError,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -44,6 +45,7 @@ from tlf_env.physics.world import World
 from tlf_env.task.actions import ActionKind
 from tlf_env.task.feasibility import (
     disturbed,
+    push_warnings,
     sensor_warnings,
     start_note,
     wall_warnings,
@@ -190,10 +192,14 @@ class Scenario(Frozen):
 
     @field_validator("world", mode="before")
     @classmethod
-    def _named_world(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            return read_preset_or_file("world", value, ", nor a mapping")
-        return value
+    def _named_world(cls, value: Any, info: ValidationInfo) -> Any:
+        """A preset or a file; a relative path starts at the scenario's folder or the working directory."""
+        if not isinstance(value, str | Path):
+            return value
+        beside = Path((info.context or {}).get("folder", "")) / value
+        if is_file_name(value) and beside.is_file():
+            value = beside
+        return read_preset_or_file("world", value, ", nor a mapping")
 
     @field_validator("reward", mode="before")
     @classmethod
@@ -493,6 +499,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
                 scenario.trajectory, robot, scenario.world, scenario.horizon_s
             )
         ]
+    lines += push_warnings(scenario.robot_models, scenario.world)
     lines += _contact_warnings(scenario)
     if scenario.observation == "sensor":
         lines += sensor_warnings(
