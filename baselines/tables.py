@@ -42,8 +42,9 @@ def metrics_table(record: Record) -> Table:
         cells = [
             "–" if row[key] is None else f"{row[key]:.{digits}f}" for _, key, digits in columns
         ]
-        ends = [name for name in ("lost", "touched") if row[name]]
-        table.add_row(str(i), *cells, " ".join(ends) or "ok")
+        ends = ["lost"] if metrics.lost else []
+        ends += [f"touched {metrics.touched_by}"] if metrics.touched else []
+        table.add_row(str(i), *cells, ", ".join(ends) or "ok")
     return table
 
 
