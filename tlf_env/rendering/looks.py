@@ -38,9 +38,13 @@ LIGHTEST = 0.92  # of the map; its end is hard to see on white
 
 # The world, each with its edge: what stands fast, what can be pushed, and what moves by itself. They differ in
 # lightness, and in their edges and marks.
-WALL, WALL_EDGE = (172, 175, 180), (104, 107, 112)
-CRATE, CRATE_EDGE = (228, 208, 176), (128, 96, 58)
-MOVER, MOVER_EDGE = (250, 228, 92), (60, 62, 66)
+WALL: Colour = (172, 175, 180)
+WALL_EDGE: Colour = (104, 107, 112)
+CRATE: Colour = (228, 208, 176)
+CRATE_EDGE: Colour = (128, 96, 58)
+MOVER: Colour = (250, 228, 92)
+MOVER_EDGE: Colour = (60, 62, 66)
+COURSE: Colour = (150, 140, 70)  # the path of what moves by itself
 SLIPPERY: Colour = (214, 233, 246)  # patches of the floor
 GRIPPY: Colour = (247, 232, 210)
 

@@ -17,6 +17,7 @@ from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.rendering.drawing import BLOCK, FLOOR, INK, Place, Shapes, View, clipped, mixed
 from tlf_env.rendering.looks import (
     CASTOR_WIDTH_MM,
+    COURSE,
     CRATE,
     CRATE_EDGE,
     DRIVE_WHEEL_WIDTH_MM,
@@ -47,15 +48,14 @@ TYRE: Colour = (48, 50, 54)
 TREAD: Colour = (205, 208, 212)
 ALARM: Colour = (236, 0, 84)  # slip, lost, touched; no robot has this colour
 
-# Inside and edge of what is in the space, and the width of the edge; None: the floor shows.
+EDGE_LINE_PX = 1.2  # of what stands fast
+# Inside and edge of what else is in the space, and the width of the edge; None: the floor shows.
 THINGS: dict[Kind, tuple[Colour | None, Colour, float]] = {
-    "fixed": (WALL, WALL_EDGE, 1.3),
     "loose": (CRATE, CRATE_EDGE, 1.3),
     "moving": (MOVER, MOVER_EDGE, 2.2),
     "zone": (None, WALL_EDGE, 1.3),
     "link": (None, INK, 1.3),
 }
-COURSE: Colour = (150, 140, 70)  # of a moving obstacle's path
 DASH_PX, COURSE_PX, MOST_DASHES = 7.0, 1.5, 1000
 
 AXLE_MM = 8.0  # in pictures only
@@ -324,8 +324,9 @@ class Renderer:
                 self._canvas.fill(colour, (x, view.top, OVERSAMPLING, view.height))
             for y in rows:
                 self._canvas.fill(colour, (view.left, y, view.width, OVERSAMPLING))
-        for thing in self._fixed:
-            self._draw_thing(view, thing)
+        for inside in (False, True):  # all edges first, so that none crosses the pieces of a wall
+            for thing in self._fixed:
+                self._draw_fixed(view, thing, inside)
         for course_mm in self._courses_mm:
             self._draw_course(view, course_mm)
         width = np.full(len(self._path_mm), PATH_PX * view.pen)
@@ -350,24 +351,37 @@ class Renderer:
         for dash in px[view.shows(px, 50.0 * view.pen).all(axis=-1)].tolist():
             self._shapes.stroke(dash, COURSE_PX * view.pen, COURSE)
 
-    def _draw_thing(self, view: View, thing: PlacedShape) -> None:
-        """A shape in the space; what can be pushed has its diagonals marked if it has four corners."""
-        fill, edge, line = THINGS[thing.kind]
-        room = 4.0 * line * view.pen
+    def _border_px(self, view: View, thing: PlacedShape, room: float) -> np.ndarray:
+        """The border of a shape in the space, on the canvas, cut ``room`` outside the window."""
         low = np.array([view.left - room, view.top - room])
         high = low + np.array([view.width, view.height]) + 2.0 * room
         corners, radius = view.px(np.array(thing.corners_mm)) - 0.5, thing.radius_mm * view.scale
         if (corners.max(axis=0) + radius < low).any() or (
             corners.min(axis=0) - radius > high
         ).any():
+            return np.zeros((0, 2))
+        return clipped(view.px(thing.border_mm()) - 0.5, low, high)
+
+    def _draw_fixed(self, view: View, thing: PlacedShape, inside: bool) -> None:
+        """The inside of what stands fast, or the line around it."""
+        width = 2.0 * EDGE_LINE_PX * view.pen
+        points = self._border_px(view, thing, 2.0 * width).tolist()
+        if inside and len(points) > 2:
+            self._shapes.fill(points, WALL)
+        elif points and not inside:
+            self._shapes.stroke(points, width, WALL_EDGE)
+
+    def _draw_thing(self, view: View, thing: PlacedShape) -> None:
+        """What does not stand fast; what can be pushed has its diagonals marked if it has four corners."""
+        fill, edge, line = THINGS[thing.kind]
+        width = line * view.pen
+        points = self._border_px(view, thing, 4.0 * width).tolist()
+        if not points:
             return
-        px = clipped(view.px(thing.border_mm()) - 0.5, low, high)
-        if not len(px):
-            return
-        points, width = px.tolist(), line * view.pen
         if fill is not None and len(points) > 2:
             self._shapes.fill(points, fill)
-        if thing.kind == "loose" and len(corners) == len(px) == 4:
+        corners = view.px(np.array(thing.corners_mm)) - 0.5
+        if thing.kind == "loose" and len(corners) == len(points) == 4:
             for ends in (corners[::2], corners[1::2]):
                 self._shapes.stroke(ends.tolist(), 0.8 * width, mixed(CRATE, edge, 0.5))
         self._shapes.stroke(points, width, edge)
