@@ -355,6 +355,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                     for patch in map(PatchRow._make, self._patches())
                     if patch.scale != 1  # otherwise the patch has no effect
                 ],
+                courses_mm=[thing.corners_mm() for thing in self.scenario.world.moving],
             )
         return self._renderer.draw(scene_of(self._formation))
 

@@ -27,6 +27,7 @@ from tlf_env.physics.objects import (
 )
 from tlf_env.physics.parameters import Body, RobotParameters, body_array
 from tlf_env.physics.reach import CLOSE_MARGIN_MM, FASTEST_CHANGE_MM_S2, time_for, way
+from tlf_env.physics.shapes import PlacedShape, Pose, placed_link, placed_shape
 from tlf_env.physics.state import Motion
 from tlf_env.physics.world import World
 
@@ -199,6 +200,41 @@ class PymunkPlant:
         self._calm_until = 0  # whatever is moved now is seen
         self._settle(motions, step)
         return self._space
+
+    def shapes(self, motions: np.ndarray, step: int) -> list[PlacedShape]:
+        """What is in the space beside the robots' outlines, where it is at a control step; only read.
+
+        ``motions`` (field, robot, 1) are the robots', to whose bodies a user may have added shapes.
+        """
+        poses = {
+            body: (motions[X, i, 0], motions[Y, i, 0], motions[THETA, i, 0])
+            for i, body in enumerate(self.bodies)
+        }
+        for mover in self._movers:
+            poses[mover.body] = (*mover.at(step * self._period_s), mover.body.angle)
+
+        def pose(body: pymunk.Body | None) -> Pose:
+            if body is None:
+                return 0.0, 0.0, 0.0
+            return poses.get(body) or (*body.position, body.angle)
+
+        found = [
+            placed_shape(shape, pose(shape.body))
+            for shape in self._space.shapes
+            if shape not in self._outlines
+        ]
+        found += [
+            placed_link(joint, pose(joint.a), pose(joint.b))
+            for joint in self._space.constraints
+            if joint not in self._floor
+        ]
+        return [one for one in found if one is not None]
+
+    def object_poses(self, step: int) -> np.ndarray:
+        """Pose of each pushed body and then of each moving obstacle at a control step, (object, 3); mm, rad."""
+        rows = [(*one.body.position, one.body.angle) for one in self._pushed]
+        rows += [(*one.at(step * self._period_s), one.body.angle) for one in self._movers]
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
     def _settle(self, motions: np.ndarray, step: int) -> None:
         self._write(motions, motions)

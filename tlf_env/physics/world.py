@@ -153,17 +153,18 @@ class MovingObstacle(Surface):
     @property
     def lap_s(self) -> float:
         """Time after which the course repeats."""
-        length = float(np.hypot(*np.diff(self._corners(), axis=0).T).sum())
+        length = float(np.hypot(*np.diff(self.corners_mm(), axis=0).T).sum())
         once = length / self.speed_mm_s
         return once if self.closed else 2.0 * (once + self.pause_s)
 
-    def _corners(self) -> np.ndarray:
+    def corners_mm(self) -> np.ndarray:
+        """Corners of the path, ``(corner, 2)``; of a closed one the first again at the end."""
         points = np.array(self.points_mm, dtype=np.float64)
         return np.concatenate([points, points[:1]]) if self.closed else points
 
     def course(self) -> Course:
         """The corners over the time of one lap."""
-        corners = self._corners()
+        corners = self.corners_mm()
         ways = np.concatenate([[0.0], np.hypot(*np.diff(corners, axis=0).T).cumsum()])
         times = ways / self.speed_mm_s
         if not self.closed:
