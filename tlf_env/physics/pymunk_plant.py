@@ -150,6 +150,7 @@ class PymunkPlant:
         space.remove(*shapes)  # with a shape its contacts go
         for body in space.bodies:
             _take_correction(body)
+            body.force, body.torque = (0.0, 0.0), 0.0
         for body, rest in self._rests.items():
             body.position, body.angle = rest.position, rest.angle
             body.velocity, body.angular_velocity = rest.velocity, rest.angular_velocity
@@ -274,8 +275,6 @@ class PymunkPlant:
         if step < self._calm_until and self._stir() == self._calm:
             return NO_OBJECTS
         space = self._space
-        if any(_is_forced(body) for body in self.bodies):
-            return WITHIN_REACH
         own = {mover.body for mover in self._movers}
         loose = [
             body
@@ -284,6 +283,8 @@ class PymunkPlant:
         ]
         for body in loose:
             self._rests.setdefault(body, _rest(body))
+        if any(_is_forced(body) for body in self.bodies):
+            return WITHIN_REACH
         self._stop_on_floor()
         floor = set(self._floor)
         if any(_is_forced(body, floor) for body in loose):
