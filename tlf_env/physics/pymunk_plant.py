@@ -100,14 +100,18 @@ class PymunkPlant:
             self.bodies, self._outlines, self._constants.T.tolist(), strict=True
         ):
             robot = Body(*row)
-            body.mass, body.moment = robot.m, robot.I
+            self._weigh(body, robot)
             outline.unsafe_set_radius(robot.outline_radius)
             outline.unsafe_set_offset((0.0, robot.outline_ahead))
         space.add(*shapes)
         self._moved: set[int] = set()
         self._moved_before: set[int] = set()
-        self._corrections: list[Correction] = []
+        self._corrections: list[tuple[pymunk.Body, Correction]] = []
         self.hit: set[int] = set()  # robots that touched a wall or a moving obstacle in a substep
+
+    def _weigh(self, body: pymunk.Body, robot: Body) -> None:
+        """Give a robot's body its mass and inertia."""
+        body.mass, body.moment = robot.m, robot.I
 
     def space(self, motions: np.ndarray) -> pymunk.Space:
         """The space with its bodies at ``motions`` (field, robot, 1)."""
@@ -190,7 +194,7 @@ class PymunkPlant:
             for outline in body.shapes:
                 outline.cache_bb()
             body.body_type = pymunk.Body.DYNAMIC
-            body.mass, body.moment = robot.m, robot.I
+            self._weigh(body, robot)
 
     def collide(self, before: np.ndarray, motions: np.ndarray, dt: float) -> None:
         """Run one substep of the space: from the poses ``before`` with the velocities of ``motions``.
@@ -201,13 +205,8 @@ class PymunkPlant:
         """
         self._write(before, motions)
         self._moved_before, self._moved = self._moved, set()
-        if self._corrections:
-            self._step_after_a_copy(dt)
-        else:
-            self._space.step(dt)
-        self.hit = set()
+        self._run(dt)
         for i, body in enumerate(self.bodies):
-            body.each_arbiter(self._remember, i)
             if body.constraints or _is_forced(body):
                 self._moved.add(i)
         for i in self._moved | self._moved_before:
@@ -216,6 +215,19 @@ class PymunkPlant:
             motions[THETA, i, 0] = body.angle
             motions[V_X, i, 0], motions[V_Y, i, 0] = body.velocity
             motions[YAW, i, 0] = body.angular_velocity
+
+    def part(self) -> None:
+        """Called after a control step that ran substep by substep."""
+
+    def _run(self, dt: float) -> None:
+        """A step of the space, and which robots a contact has moved in it."""
+        if self._corrections:
+            self._step_after_a_copy(dt)
+        else:
+            self._space.step(dt)
+        self.hit = set()
+        for i, body in enumerate(self.bodies):
+            body.each_arbiter(self._remember, i)
 
     def _remember(self, arbiter: pymunk.Arbiter, robot: int) -> None:
         self._moved.add(robot)
@@ -235,10 +247,10 @@ class PymunkPlant:
                 arbiter.state = SEPARATED
             _advance_corrected(correction, body, dt)
 
-        for body, correction in zip(self._space.bodies, self._corrections, strict=True):
+        for body, correction in self._corrections:
             body.position_func = partial(advance, correction)
         self._space.step(dt)
-        for body in self._space.bodies:
+        for body, _ in self._corrections:
             body.position_func = pymunk.Body.update_position
             body._position_func = None  # pymunk before 7.3.1 keeps the last one, and copies it
         self._corrections = []
@@ -246,7 +258,7 @@ class PymunkPlant:
     def __getstate__(self) -> dict[str, Any]:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
         if not self._corrections:
-            self._corrections = [_take_correction(body) for body in self._space.bodies]
+            self._corrections = [(body, _take_correction(body)) for body in self._space.bodies]
         return self.__dict__.copy()
 
 

@@ -121,7 +121,7 @@ class Scenario(Frozen):
     physics_period_s: Positive = 0.001
     control_period_s: Positive = DEFAULT_CONTROL_PERIOD_S
     horizon_s: Positive = 100.0
-    plant: Literal["pymunk", "batch", "kinematic"] = "pymunk"
+    plant: Literal["pymunk", "batch", "kinematic", "chipmunk"] = "pymunk"
 
     wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
     estimator: EstimatorKind | PartPath = "ekf"
@@ -264,6 +264,10 @@ class Scenario(Frozen):
             raise ValueError(f"{role} {path!r} is a Python object, which cannot run in a batch")
         if self.adversary:
             raise ValueError("adversary True cannot be used with plant 'batch'")
+        if self.plant == "chipmunk":
+            raise ValueError(
+                "plant 'chipmunk' moves one formation at a time; 'batch' and 'kinematic' can run in a batch"
+            )
 
     @property
     def robot_count(self) -> int:
