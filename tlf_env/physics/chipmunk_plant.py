@@ -8,6 +8,7 @@ limit of its force.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -45,25 +46,38 @@ FORCES = ("axle", "forward_l", "forward_r", "castor_across", "castor_along")
 TORQUES = ("spin_l", "spin_r", "spin_c", "steering")
 LIMITS = (*FORCES, *TORQUES)
 
+ANGLES = [Motion._fields.index(name) for name in ("angle_l", "angle_r")]
+DRIVE_SPINS = [Motion._fields.index(name) for name in ("omega_l", "omega_r")]
+INVERSE_J = Body._fields.index("inverse_J")
+
 read_floor = reader(Floor)
 
 
 @law
 def circle_limits(
-    p_1: float, p_2: float, s_1: float, s_2: float, w_1: float, w_2: float, radius: float
+    b_1: float, b_2: float, w_1: float, w_2: float, radius: float
 ) -> tuple[float, float]:
-    """Limits of two perpendicular friction impulses, whose vector never leaves the circle of ``radius``.
+    """Limits of two perpendicular friction impulses, whose vector then never leaves the circle of ``radius``.
 
-    They come from the last impulses ``p``, the slip velocities ``s`` that were left, and the inverse masses
-    ``w``: from ``s`` and ``p`` follows what the slip would be without friction, and from that the impulse
-    on the circle. While the tyre sticks, both directions get the same room.
+    ``b`` is an estimate of the slip that there would be without friction, ``w`` are the inverse masses. If
+    the tyre slides, the limits are the components of the impulse on the circle. If it sticks, they are the
+    impulses that it needs, and the same room for more in both directions.
     """
-    b_1, b_2 = abs(s_1) + w_1 * abs(p_1), abs(s_2) + w_2 * abs(p_2)
     q_1, q_2, lam = disc(w_1, w_2, 0.0, b_1, b_2, radius)
     if lam > 0.0:
         return abs(q_1), abs(q_2)
     room = 0.5 * max(radius * radius - q_1 * q_1 - q_2 * q_2, 0.0)
     return math.sqrt(q_1 * q_1 + room), math.sqrt(q_2 * q_2 + room)
+
+
+@law
+def with_sign(p: float, q: float, turned: float, R: float) -> float:
+    """A tyre's impulse ``p`` with its sign: with the joint's ``q`` it makes the wheel's change of spin.
+
+    Chipmunk gives both without their signs; ``turned`` is the angular momentum ± q − R p.
+    """
+    up, down = (q - turned) / R, (-q - turned) / R
+    return math.copysign(p, up if abs(abs(up) - p) < abs(abs(down) - p) else down)
 
 
 @law
@@ -89,33 +103,44 @@ def set_limits(
     motions: np.ndarray,
     contacts: np.ndarray,
     floors: np.ndarray,
+    jumps: np.ndarray,
     limits: np.ndarray,
     dt: float,
 ) -> None:
-    """Write the limits of the coming substep, (limit, robot), in mN and mN·mm; arrays (field, robot, 1)."""
+    """Write the limits of the coming substep, (limit, robot), in mN and mN·mm; arrays (field, robot, 1).
+
+    The slip that there would be without friction is estimated: the last slip, less what the last impulse
+    did, and what the jumps of the motors' torques (2, robot) will do.
+    """
     for i in range(bodies.shape[1]):
-        body, motion, floor = (
-            read_body(bodies, i, 0),
-            read_motion(motions, i, 0),
-            read_floor(floors, i, 0),
-        )
-        contact = read_contact(contacts, i, 0)
+        body, motion = read_body(bodies, i, 0), read_motion(motions, i, 0)
+        contact, floor = read_contact(contacts, i, 0), read_floor(floors, i, 0)
         most = friction_limits(body, motion, contact, floor, dt)
         slips, cos_p, sin_p = slips_of(body, motion, floor)
-        w_ff = body.w_ff + body.spin_drive
+        w_ff, turn = body.w_ff + body.spin_drive, body.R * body.inverse_J * dt
         e_l, f_l = circle_limits(
-            contact.p_le, contact.p_lf, slips.e, slips.lf, body.w_ee, w_ff, most.grip_l
+            abs(slips.e) + body.w_ee * abs(contact.p_le),
+            slips.lf - w_ff * contact.p_lf - turn * jumps[0, i],
+            body.w_ee,
+            w_ff,
+            most.grip_l,
         )
         e_r, f_r = circle_limits(
-            contact.p_re, contact.p_rf, slips.e, slips.rf, body.w_ee, w_ff, most.grip_r
+            abs(slips.e) + body.w_ee * abs(contact.p_re),
+            slips.rf - w_ff * contact.p_rf - turn * jumps[1, i],
+            body.w_ee,
+            w_ff,
+            most.grip_r,
         )
         q_cos, q_sin = body.q * cos_p, body.q * sin_p
-        across = (
-            body.inverse_m + q_cos * q_cos * body.inverse_I + body.T * body.T * body.inverse_I_s
-        )
-        along = body.inverse_m + q_sin * q_sin * body.inverse_I + body.spin_castor
+        w_xx = body.inverse_m + q_cos * q_cos * body.inverse_I + body.T * body.T * body.inverse_I_s
+        w_yy = body.inverse_m + q_sin * q_sin * body.inverse_I + body.spin_castor
         x_c, y_c = circle_limits(
-            contact.p_cx, contact.p_cy, slips.cx, slips.cy, across, along, most.grip_c
+            abs(slips.cx) + w_xx * abs(contact.p_cx),
+            abs(slips.cy) + w_yy * abs(contact.p_cy),
+            w_xx,
+            w_yy,
+            most.grip_c,
         )
         limits[0, i] = (e_l + e_r) / dt
         limits[1, i], limits[2, i] = f_l / dt, f_r / dt
@@ -130,38 +155,36 @@ def record(
     motions: np.ndarray,
     contacts: np.ndarray,
     floors: np.ndarray,
+    spins: np.ndarray,
     impulses: np.ndarray,
     dt: float,
 ) -> None:
     """Write ``contacts`` after a substep from the constraints' impulses, (limit, robot).
 
-    They are without sign, as Chipmunk gives them. ``contacts`` still has the slips from before.
+    ``spins`` (2, robot) are the drive wheels' with the torques and without friction. Impulses but those
+    along the drive wheels are without sign, as Chipmunk gives them.
     """
     for i in range(bodies.shape[1]):
-        body, motion, floor = (
-            read_body(bodies, i, 0),
-            read_motion(motions, i, 0),
-            read_floor(floors, i, 0),
-        )
-        contact = read_contact(contacts, i, 0)
-        p_le, p_re = share_lateral(
-            impulses[0, i],
-            impulses[1, i],
-            0.0,
-            impulses[2, i],
-            grip(body, body.load_drive, floor.grip_l, contact.slip_l, dt),
-            grip(body, body.load_drive, floor.grip_r, contact.slip_r, dt),
-        )
+        body, motion = read_body(bodies, i, 0), read_motion(motions, i, 0)
+        contact, floor = read_contact(contacts, i, 0), read_floor(floors, i, 0)
+        q_l, q_r = impulses[5, i], impulses[6, i]
+        turned_l = body.J * (motion.omega_l - spins[0, i])
+        turned_r = body.J * (motion.omega_r - spins[1, i])
+        p_lf = with_sign(impulses[1, i], q_l, turned_l, body.R)
+        p_rf = with_sign(impulses[2, i], q_r, turned_r, body.R)
+        grip_l = grip(body, body.load_drive, floor.grip_l, contact.slip_l, dt)
+        grip_r = grip(body, body.load_drive, floor.grip_r, contact.slip_r, dt)
+        p_le, p_re = share_lateral(impulses[0, i], p_lf, 0.0, p_rf, grip_l, grip_r)
         slips, _, _ = slips_of(body, motion, floor)
         after = Contact(
             p_le=p_le,
-            p_lf=impulses[1, i],
+            p_lf=p_lf,
             p_re=p_re,
-            p_rf=impulses[2, i],
+            p_rf=p_rf,
             p_cx=impulses[3, i],
             p_cy=impulses[4, i],
-            q_l=impulses[5, i],
-            q_r=impulses[6, i],
+            q_l=q_l,
+            q_r=q_r,
             q_c=impulses[7, i],
             q_s=impulses[8, i],
             slip_l=math.sqrt(slips.e * slips.e + slips.lf * slips.lf),
@@ -265,8 +288,8 @@ class RobotBodies:
         for spin, omega in zip(self.spins, speeds, strict=True):
             spin.angular_velocity = omega
 
-    def place(self, torques: tuple[float, float], belts: tuple[float, float], dt: float) -> None:
-        """Apply the motors' torques, and place wheels and frames for the coming substep.
+    def place(self, speeds: Sequence[float], belts: Sequence[float], dt: float) -> None:
+        """Set the drive wheels' spins, and place wheels and frames for the coming substep.
 
         Chipmunk moves all bodies by their velocities before it solves, so that the places are those after
         that movement. ``belts`` are the speeds of the floor under the drive wheels.
@@ -281,10 +304,7 @@ class RobotBodies:
         y += v_y * dt - self.ahead * (cos - cos_0)
         self.frame.angle, self.frame.position = theta, (x, y)
         x, y = x - r.d * sin, y + r.d * cos
-        for spin, side, torque, belt in zip(
-            (left, right), (-r.h, r.h), torques, belts, strict=True
-        ):
-            omega = spin.angular_velocity + torque * dt / r.J
+        for spin, side, omega, belt in zip((left, right), (-r.h, r.h), speeds, belts, strict=True):
             ahead, aside = ARM_MM - belt * dt, side - r.R
             spin.angular_velocity, spin.angle = omega, theta - omega * dt
             spin.velocity = -belt * sin, belt * cos
@@ -333,9 +353,11 @@ class ChipmunkPlant(PymunkPlant):
     """Robots of pymunk's bodies and constraints, in a space that they share with a user's objects.
 
     Between control steps the space has the chassis only, and what the user put there. A control step is
-    :meth:`sort`, :meth:`advance` for each substep, and :meth:`part`; so a copy that is made between
-    control steps goes on as the original does.
+    :meth:`sort`, :meth:`advance` for each substep, and :meth:`part`. All constraints are made anew in each,
+    so a copy that is made between control steps goes on as the original does.
     """
+
+    kind = RobotBodies
 
     def __init__(self, robots: list[RobotParameters], iterations: int = ITERATIONS) -> None:
         self._robots: list[RobotBodies] = []
@@ -344,21 +366,26 @@ class ChipmunkPlant(PymunkPlant):
         self._limits = np.zeros((len(LIMITS), len(robots)))
         self._impulses = np.zeros_like(self._limits)
 
+    def reset(self, constants: np.ndarray | None = None) -> None:
+        """As of the plant ``pymunk``."""
+        super().reset(constants)
+        self._torques = np.zeros((2, len(self.bodies)))  # of the last substep
+
     def _weigh(self, body: pymunk.Body, robot: Body) -> None:
         i = self.bodies.index(body)
         if i == len(self._robots):
-            self._robots.append(RobotBodies(body, robot))
+            self._robots.append(self.kind(body, robot))
         self._robots[i].weigh(robot)
 
     def _write(self, poses: np.ndarray, velocities: np.ndarray) -> None:
         """Chassis only; their velocities are those of their own centres of mass."""
         super()._write(poses, velocities)
         for robot in self._robots:
-            arm = robot.chassis.rotation_vector * (robot.ahead * robot.chassis.angular_velocity)
-            robot.chassis.velocity -= arm
+            w = robot.chassis.angular_velocity
+            robot.chassis.velocity -= robot.chassis.rotation_vector * (robot.ahead * w)
 
     def objects(self, *args: Any) -> int:
-        """Something may always act on a robot: it moves in the space only."""
+        """Something may always act on a robot, because it moves in the space only."""
         super().objects(*args)
         return WITHIN_REACH
 
@@ -371,10 +398,8 @@ class ChipmunkPlant(PymunkPlant):
         for i, robot in enumerate(self._robots):
             robot.join(self._space)
             robot.write(Motion(*motions[:, i, 0].tolist()))
-        if users:
-            self._space.add(
-                *users
-            )  # after the robots' own, in the same order in a copy as in the original
+        if users:  # again, so that they come in the same order in a copy as in the original
+            self._space.add(*users)
 
     def part(self) -> None:
         """End a control step: only the chassis stay in the space."""
@@ -391,20 +416,17 @@ class ChipmunkPlant(PymunkPlant):
     ) -> None:
         """One substep in place; arrays (field, robot, 1), torques in mN·mm, ``floors`` as :class:`Floor`."""
         bodies = self._constants[:, :, None]
-        set_limits(bodies, motions, contacts, floors, self._limits, dt)
+        jumps, self._torques = torques[:, :, 0] - self._torques, torques[:, :, 0].copy()
+        set_limits(bodies, motions, contacts, floors, jumps, self._limits, dt)
+        spins = motions[DRIVE_SPINS, :, 0]
+        angles = motions[ANGLES, :, 0] + dt * spins
+        spins = spins + dt * self._torques * self._constants[INVERSE_J]
         for i, robot in enumerate(self._robots):
             for constraint, limit in zip(robot.limited, self._limits[:, i].tolist(), strict=True):
                 constraint.max_force = limit
-            belt_l, belt_r = floors[:2, i, 0].tolist()
-            torque_l, torque_r = torques[:, i, 0].tolist()
-            robot.place((torque_l, torque_r), (belt_l, belt_r), dt)
-        angles = motions[ANGLES, :, 0] + dt * motions[DRIVE_SPINS, :, 0]
+            robot.place(spins[:, i].tolist(), floors[:2, i, 0].tolist(), dt)
         self._run(dt)
         for i, robot in enumerate(self._robots):
             motions[:, i, 0] = robot.read(*angles[:, i].tolist())
             self._impulses[:, i] = [constraint.impulse for constraint in robot.limited]
-        record(bodies, motions, contacts, floors, self._impulses, dt)
-
-
-ANGLES = [Motion._fields.index(name) for name in ("angle_l", "angle_r")]
-DRIVE_SPINS = [Motion._fields.index(name) for name in ("omega_l", "omega_r")]
+        record(bodies, motions, contacts, floors, spins, self._impulses, dt)
