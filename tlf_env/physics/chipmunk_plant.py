@@ -36,7 +36,7 @@ from tlf_env.physics.sweeps import Slips, share_lateral, tyre_slips
 ITERATIONS = 50
 # The fork's share of the mass. It changes nothing about the robot, whose mass, centre of mass and inertia
 # are those of its parameters; but iterations converge slowly between bodies of very different mass.
-FORK_SHARE = 0.1
+FORK_SHARE = 0.05
 ARM_MM = 1000.0  # between the two ends of a tyre's constraint: long, so that its direction is exact
 HELD_KG = 1e12  # of bodies that only turn
 REST = 1e-9  # mm/s and rad/s: a robot whose bodies are all slower is at rest
@@ -44,7 +44,6 @@ REST = 1e-9  # mm/s and rad/s: a robot whose bodies are all slower is at rest
 # Rows of the array of limits: largest forces, and largest torques of friction at the joints.
 FORCES = ("axle", "forward_l", "forward_r", "castor_across", "castor_along")
 TORQUES = ("spin_l", "spin_r", "spin_c", "steering")
-LIMITS = (*FORCES, *TORQUES)
 
 ANGLES = [Motion._fields.index(name) for name in ("angle_l", "angle_r")]
 DRIVE_SPINS = [Motion._fields.index(name) for name in ("omega_l", "omega_r")]
@@ -107,8 +106,9 @@ def set_limits(
     limits: np.ndarray,
     dt: float,
 ) -> None:
-    """Write the limits of the coming substep, (limit, robot), in mN and mN·mm; arrays (field, robot, 1).
+    """Write the limits of the coming substep, (FORCES and TORQUES, robot), in mN and mN·mm.
 
+    The other arrays are (field, robot, 1).
     The slip that there would be without friction is estimated: the last slip, less what the last impulse
     did, and what the jumps of the motors' torques (2, robot) will do.
     """
@@ -159,7 +159,7 @@ def record(
     impulses: np.ndarray,
     dt: float,
 ) -> None:
-    """Write ``contacts`` after a substep from the constraints' impulses, (limit, robot).
+    """Write ``contacts`` after a substep from the constraints' impulses, (FORCES and TORQUES, robot).
 
     ``spins`` (2, robot) are the drive wheels' with the torques and without friction. Impulses but those
     along the drive wheels are without sign, as Chipmunk gives them.
@@ -215,13 +215,16 @@ class RobotBodies:
       the tyres' constraints across the wheels.
     """
 
+    tyre_count = len(FORCES)
+    rim_mm = ARM_MM  # how far ahead of its tyre a wheel's rim is held
+
     def __init__(self, chassis: pymunk.Body, robot: Body) -> None:
         self.chassis = chassis
         self.fork = pymunk.Body()
         self.spins = [pymunk.Body(HELD_KG, 1.0) for _ in range(3)]  # left, right, castor
         self.frame = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
         self.fork_frame = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
-        self.limited: list[pymunk.Constraint] = []  # in the order of LIMITS
+        self.limited: list[pymunk.Constraint] = []  # tyres as in FORCES, then joints as in TORQUES
         self.constraints: list[pymunk.Constraint] = []
         self.weigh(robot)
 
@@ -245,24 +248,32 @@ class RobotBodies:
         for spin, inertia in zip(self.spins, (robot.J, robot.J, robot.J_c), strict=True):
             spin.moment = inertia
 
-    def join(self, space: pymunk.Space) -> None:
-        """Make all constraints anew, without memory of earlier impulses, and add everything to the space."""
+    def tyres(self) -> list[pymunk.Constraint]:
+        """The tyres' constraints, in the order of ``FORCES``.
+
+        The tyres of both drive wheels act along the axle, so that only the sum of their lateral forces
+        matters: one constraint has it.
+        """
         r, chassis, fork = self.robot, self.chassis, self.fork
         left, right, castor = self.spins
-        pivot = pymunk.PivotJoint(chassis, fork, (0.0, -r.q), (0.0, 0.0))
-        pivot.max_bias = 0.0  # the fork is put on its pivot in every control step
-        # The tyres of both drive wheels act along the axle, so that only the sum of their lateral forces
-        # matters: one constraint has it.
-        self.limited = [
+        return [
             pin(self.frame, chassis, (-ARM_MM, r.d), (0.0, r.d)),
             pin(chassis, left, (-r.h, r.d), (r.R, 0.0)),
             pin(chassis, right, (r.h, r.d), (r.R, 0.0)),
             pin(self.fork_frame, fork, (-ARM_MM, -r.T), (0.0, -r.T)),
             pin(fork, castor, (0.0, -r.T), (r.R_c, 0.0)),
-            *(pymunk.SimpleMotor(space.static_body, spin, 0.0) for spin in self.spins),
-            pymunk.SimpleMotor(chassis, fork, 0.0),
         ]
-        tyres, joints = self.limited[: len(FORCES)], self.limited[len(FORCES) :]
+
+    def join(self, space: pymunk.Space) -> None:
+        """Make all constraints anew, without memory of earlier impulses, and add everything to the space."""
+        pivot = pymunk.PivotJoint(self.chassis, self.fork, (0.0, -self.robot.q), (0.0, 0.0))
+        pivot.max_bias = 0.0  # the fork is put on its pivot in every control step
+        tyres = self.tyres()
+        joints = [
+            *(pymunk.SimpleMotor(space.static_body, spin, 0.0) for spin in self.spins),
+            pymunk.SimpleMotor(self.chassis, self.fork, 0.0),
+        ]
+        self.limited = [*tyres, *joints]
         self.constraints = [*joints, *tyres, pivot]  # Chipmunk solves them in this order
         space.add(*self.bodies, *self.constraints)
 
@@ -305,7 +316,7 @@ class RobotBodies:
         self.frame.angle, self.frame.position = theta, (x, y)
         x, y = x - r.d * sin, y + r.d * cos
         for spin, side, omega, belt in zip((left, right), (-r.h, r.h), speeds, belts, strict=True):
-            ahead, aside = ARM_MM - belt * dt, side - r.R
+            ahead, aside = self.rim_mm - belt * dt, side - r.R
             spin.angular_velocity, spin.angle = omega, theta - omega * dt
             spin.velocity = -belt * sin, belt * cos
             spin.position = x + aside * cos - ahead * sin, y + aside * sin + ahead * cos
@@ -314,7 +325,7 @@ class RobotBodies:
         x, y = x + v_x * dt, y + v_y * dt
         sin, cos = math.sin(psi), math.cos(psi)
         self.fork_frame.angle, self.fork_frame.position = psi, (x, y)
-        ahead, aside = ARM_MM - r.T, -r.R_c
+        ahead, aside = self.rim_mm - r.T, -r.R_c
         castor.angle, castor.velocity = psi - castor.angular_velocity * dt, (0.0, 0.0)
         castor.position = x + aside * cos - ahead * sin, y + aside * sin + ahead * cos
 
@@ -363,7 +374,7 @@ class ChipmunkPlant(PymunkPlant):
         self._robots: list[RobotBodies] = []
         super().__init__(robots)
         self._space.iterations = iterations
-        self._limits = np.zeros((len(LIMITS), len(robots)))
+        self._limits = np.zeros((self.kind.tyre_count + len(TORQUES), len(robots)))
         self._impulses = np.zeros_like(self._limits)
 
     def reset(self, constants: np.ndarray | None = None) -> None:
@@ -415,9 +426,8 @@ class ChipmunkPlant(PymunkPlant):
         dt: float,
     ) -> None:
         """One substep in place; arrays (field, robot, 1), torques in mN·mm, ``floors`` as :class:`Floor`."""
-        bodies = self._constants[:, :, None]
         jumps, self._torques = torques[:, :, 0] - self._torques, torques[:, :, 0].copy()
-        set_limits(bodies, motions, contacts, floors, jumps, self._limits, dt)
+        self._limit(motions, contacts, floors, jumps, dt)
         spins = motions[DRIVE_SPINS, :, 0]
         angles = motions[ANGLES, :, 0] + dt * spins
         spins = spins + dt * self._torques * self._constants[INVERSE_J]
@@ -429,4 +439,26 @@ class ChipmunkPlant(PymunkPlant):
         for i, robot in enumerate(self._robots):
             motions[:, i, 0] = robot.read(*angles[:, i].tolist())
             self._impulses[:, i] = [constraint.impulse for constraint in robot.limited]
+        self._record(motions, contacts, floors, spins, dt)
+
+    def _limit(
+        self,
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        floors: np.ndarray,
+        jumps: np.ndarray,
+        dt: float,
+    ) -> None:
+        bodies = self._constants[:, :, None]
+        set_limits(bodies, motions, contacts, floors, jumps, self._limits, dt)
+
+    def _record(
+        self,
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        floors: np.ndarray,
+        spins: np.ndarray,
+        dt: float,
+    ) -> None:
+        bodies = self._constants[:, :, None]
         record(bodies, motions, contacts, floors, spins, self._impulses, dt)

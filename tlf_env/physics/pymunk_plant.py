@@ -94,7 +94,7 @@ class PymunkPlant:
         for body in space.bodies:
             _take_correction(body)
         for body, rest in self._rests.items():
-            body.position, body.angle = rest.position, rest.angle
+            body.angle, body.position = rest.angle, rest.position
             body.velocity, body.angular_velocity = rest.velocity, rest.angular_velocity
         for body, outline, row in zip(
             self.bodies, self._outlines, self._constants.T.tolist(), strict=True
@@ -289,6 +289,8 @@ def _take_correction(body: pymunk.Body) -> Correction:
 
     pymunk has no property for it. But a body at rest at the origin goes just that far in one second.
     """
+    centre = body.center_of_gravity
+    _move_origin(body, (0.0, 0.0))
     pose, twist = (body.position, body.angle), (body.velocity, body.angular_velocity)
     body.position, body.angle, body.velocity, body.angular_velocity = (
         (0.0, 0.0),
@@ -300,7 +302,14 @@ def _take_correction(body: pymunk.Body) -> Correction:
     correction = Correction(*body.position, body.angle)
     body.position, body.angle = pose
     body.velocity, body.angular_velocity = twist
+    _move_origin(body, centre)
     return correction
+
+
+def _move_origin(body: pymunk.Body, centre: tuple[float, float]) -> None:
+    """Move a body's origin so that its centre of mass, which stays where it is, is at ``centre``."""
+    body.center_of_gravity = centre
+    body.angle = body.angle  # only now does the position follow
 
 
 def _advance_corrected(correction: Correction, body: pymunk.Body, dt: float) -> None:
