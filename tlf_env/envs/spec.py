@@ -153,8 +153,9 @@ state, for critics.
 
 ## Objects in the space
 
-On the plant `pymunk` (the default), `env.space` is a [pymunk](https://www.pymunk.org) space in mm, s and kg
-(forces in mN), and `env.robot_bodies` contains the robots' bodies in it. What you add to it takes part:
+On the plants `pymunk` (the default) and `chipmunk`, `env.space` is a [pymunk](https://www.pymunk.org) space in
+mm, s and kg (forces in mN), and `env.robot_bodies` contains the robots' bodies in it. What you add to it takes
+part:
 
 ```python
 import pymunk
@@ -174,12 +175,13 @@ env.space.add(
 
 - A robot that meets a static or kinematic shape (a wall, a moving obstacle) is `touched`, as by another robot.
   A dynamic body (a box) can be pushed, and is not counted. The outlines of the robots have no friction.
-- Constraints, such as a rope to a trailer, and forces act on robots, too; the wheels answer one substep later.
+- Constraints, such as a rope to a trailer, and forces act on robots, too; the wheels answer one substep later,
+  on `chipmunk` in the same one. There `env.robot_bodies` are the chassis alone ([chipmunk.md](chipmunk.md)).
 - A dynamic body slides without friction on the floor, unless its `velocity_func` slows it down.
 - `reset` keeps the objects, and puts each body back to where the first step found it. Copies and pickles take
   them along; functions of yours must be picklable for that.
-- A control step takes about twenty times as long while an object is near enough to a robot to act on it, and
-  always with constraints or forces. Objects out of reach change no bit of the robots' motion.
+- On `pymunk`, a control step takes about twenty times as long while an object is near enough to a robot to act
+  on it, and always with constraints or forces. Objects out of reach change no bit of the robots' motion.
 
 ## Many formations
 

@@ -121,6 +121,8 @@ class Scenario(Frozen):
     physics_period_s: Positive = 0.001
     control_period_s: Positive = DEFAULT_CONTROL_PERIOD_S
     horizon_s: Positive = 100.0
+    # What moves the robots: `pymunk` is the exact kernel, with contact in a pymunk space; `batch` the kernel
+    # alone; `kinematic` the wheels' commands; `chipmunk` pymunk's own bodies and constraints.
     plant: Literal["pymunk", "batch", "kinematic", "chipmunk"] = "pymunk"
 
     wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
