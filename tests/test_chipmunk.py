@@ -40,7 +40,7 @@ PER_CONTROL_STEP = 20
 LONGEST_S = 4.0  # of a golden run here; docs/chipmunk.md has them whole
 # Largest error at 1 ms: position as a share of the path, and heading in rad. See docs/chipmunk.md.
 GOLDEN_BOUNDS = {
-    "straight": (0.005e-2, 1e-6),
+    "straight": (0.01e-2, 1e-6),
     "straight_nojf": (0.03e-2, 1e-6),
     "coast": (0.04e-2, 0.001),
     "skid": (0.06e-2, 0.003),
