@@ -78,7 +78,7 @@ def run(
     for k in range(steps):
         if k % PER_CONTROL_STEP == 0:
             if k:
-                plant.part()
+                plant.release()
             plant.sort(motions)
         each = np.ones((1, len(starts), 1))
         plant.advance(
@@ -220,7 +220,7 @@ def test_injected_slip_is_that_of_eq_14(delta_1, delta_2):
     assert turn[-50:] == pytest.approx(delta_2, abs=1e-6)
 
 
-def test_a_payload_beyond_the_pivot_leaves_a_mass_to_the_chassis():
+def test_a_long_arm_of_the_castor_leaves_inertia_to_the_chassis():
     long = RobotParameters(castor_pivot_mm=385.0, com_offset_mm=80.0, body_inertia_kg_mm2=500.0)
     plant = ChipmunkPlant([long])
     chassis = plant.bodies[0]
@@ -400,6 +400,22 @@ def test_between_steps_the_space_has_only_the_chassis_and_what_a_user_put_there(
     driven(env, observations, 5)
     assert set(env.space.bodies) == set(env.robot_bodies.values())
     assert list(env.space.constraints) == [rope]
+
+
+def test_a_payload_is_part_of_the_bodies():
+    env = environment(robots=1, disturbance="payload")
+    env.reset(seed=0)
+    laden = env.formation.named("body")
+    driven(env, env.reset(seed=0)[0], 2)
+    bodies = env.formation.plant._robots[0]
+    assert laden.m[0] > ROBOT.mass_kg + 0.1
+    assert bodies.chassis.mass + bodies.fork.mass == pytest.approx(laden.m[0])
+    ahead = bodies.chassis.center_of_gravity.y
+    inertia = (
+        bodies.chassis.moment + bodies.chassis.mass * ahead**2 + bodies.fork.mass * laden.q[0] ** 2
+    )
+    assert inertia == pytest.approx(laden.I[0])
+    assert bodies.chassis.mass * ahead == pytest.approx(bodies.fork.mass * laden.q[0])
 
 
 def test_it_cannot_run_in_a_batch():

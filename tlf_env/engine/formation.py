@@ -205,7 +205,7 @@ class Formation:
                 close=result == drivers.MUST_COLLIDE or objects == WITHIN_REACH
             )
         finally:
-            self.plant.part()
+            self.plant.release()
         drivers.transmit(arrays, 0, settings)
         drivers.refer(
             arrays, 0, 0, 1 if settings.external_observer else self.scenario.robot_count, settings

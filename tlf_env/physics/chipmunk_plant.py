@@ -277,7 +277,7 @@ class RobotBodies:
         self.constraints = [*joints, *tyres, pivot]  # Chipmunk solves them in this order
         space.add(*self.bodies, *self.constraints)
 
-    def part(self, space: pymunk.Space) -> None:
+    def leave(self, space: pymunk.Space) -> None:
         """Take everything but the chassis out of the space."""
         space.remove(*self.constraints, *self.bodies)
         self.limited, self.constraints = [], []
@@ -364,7 +364,7 @@ class ChipmunkPlant(PymunkPlant):
     """Robots of pymunk's bodies and constraints, in a space that they share with a user's objects.
 
     Between control steps the space has the chassis only, and what the user put there. A control step is
-    :meth:`sort`, :meth:`advance` for each substep, and :meth:`part`. All constraints are made anew in each,
+    :meth:`sort`, :meth:`advance` for each substep, and :meth:`release`. All constraints are made anew in each,
     so a copy that is made between control steps goes on as the original does.
     """
 
@@ -412,10 +412,10 @@ class ChipmunkPlant(PymunkPlant):
         if users:  # again, so that they come in the same order in a copy as in the original
             self._space.add(*users)
 
-    def part(self) -> None:
+    def release(self) -> None:
         """End a control step: only the chassis stay in the space."""
         for robot in self._robots:
-            robot.part(self._space)
+            robot.leave(self._space)
 
     def advance(
         self,

@@ -164,7 +164,7 @@ def advance_chipmunk(
     plant.sort(motions)
     for pair in torques:
         plant.advance(motions, contacts, pair.reshape(2, 1, 1), floors, dt)
-    plant.part()
+    plant.release()
 
 
 def _row(t_s: float, motion: Motion, d_mm: float) -> list[float]:

@@ -216,7 +216,7 @@ class PymunkPlant:
             motions[V_X, i, 0], motions[V_Y, i, 0] = body.velocity
             motions[YAW, i, 0] = body.angular_velocity
 
-    def part(self) -> None:
+    def release(self) -> None:
         """Called after a control step that ran substep by substep."""
 
     def _run(self, dt: float) -> None:
