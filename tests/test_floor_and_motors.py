@@ -56,10 +56,12 @@ def acceleration(places):
     return 2 * np.polyfit(t_s, places, 2)[0]
 
 
-def test_a_robot_rolls_down_a_slope_by_g_sin():
+@pytest.mark.parametrize("plant", ["pymunk", "chipmunk"])
+def test_a_robot_rolls_down_a_slope_by_g_sin(plant):
     slope = 0.05
-    rows = driven(50, robot=FREE, floor={"slope_rad": slope, "uphill_rad": math.pi})
-    assert acceleration(rows[:, 1]) == pytest.approx(G * math.sin(slope) * M / M_ROLLING, rel=1e-3)
+    rows = driven(50, robot=FREE, floor={"slope_rad": slope, "uphill_rad": math.pi}, plant=plant)
+    expected = G * math.sin(slope) * M / M_ROLLING
+    assert acceleration(rows[:, 1]) == pytest.approx(expected, rel=2e-3)
 
 
 def test_a_robot_across_a_slope_holds_up_to_static_friction_and_slides_beyond():
@@ -75,11 +77,11 @@ def test_a_robot_across_a_slope_holds_up_to_static_friction_and_slides_beyond():
     assert speed == pytest.approx(expected * 0.49, rel=0.03)
 
 
-@pytest.mark.parametrize("plant", ["pymunk", "batch"])
+@pytest.mark.parametrize("plant", ["pymunk", "batch", "chipmunk"])
 def test_a_push_accelerates_by_force_over_mass(plant):
     along = driven(50, robot=FREE, push={"y_N": 0.2}, plant=plant)
-    assert acceleration(along[:, 1]) == pytest.approx(200.0 / M_ROLLING, rel=1e-3)
-    sideways = driven(25, push={"x_N": 3.0})
+    assert acceleration(along[:, 1]) == pytest.approx(200.0 / M_ROLLING, rel=2e-3)
+    sideways = driven(25, push={"x_N": 3.0}, plant=plant)
     expected = (3000.0 - ROBOT.tyre.mu_dynamic * M * G) / M
     speed = (sideways[-1, 0] - sideways[-2, 0]) / PERIOD_S
     assert speed == pytest.approx(expected * 0.49, rel=0.03)
@@ -140,6 +142,11 @@ def test_a_tyre_creeps_by_its_share_of_load():
     # Wheel speeds are those at the end of a step, and places give those at its middle: a step's change.
     assert slip / rolling[middle] == pytest.approx(creep * force / load, rel=0.05)
     assert rows[middle, 3] == pytest.approx(creep * force / load * rolling[middle], rel=0.02)
+
+
+def test_a_plant_without_creep_says_so():
+    with pytest.raises(ValueError, match="tyre.creep needs 'pymunk' or 'batch'"):
+        driven(1, tyre={"creep": 0.1}, plant="chipmunk")
 
 
 def test_creep_vanishes_at_rest_and_at_zero():

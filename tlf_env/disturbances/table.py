@@ -15,6 +15,7 @@ from tlf_env.disturbances.channels import CHANNELS, Channel
 UNITS = {
     "_kg_mm2": "kg·mm²",
     "_s_rad": "s/rad",
+    "_per_s": "1/s",
     "_rad_s": "rad/s",
     "_mm_s": "mm/s",
     "_Nmm": "N·mm",

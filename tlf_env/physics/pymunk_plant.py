@@ -20,13 +20,14 @@ from pymunk.batch import BodyFields, Buffer, get_space_bodies
 from tlf_env.physics.objects import (
     Mover,
     Pushed,
+    build_fixed,
     build_movers,
     build_pushables,
-    build_statics,
     damped_velocity,
 )
 from tlf_env.physics.parameters import Body, RobotParameters, body_array
 from tlf_env.physics.reach import CLOSE_MARGIN_MM, FASTEST_CHANGE_MM_S2, time_for, way
+from tlf_env.physics.shapes import PlacedShape, Pose, placed_link, placed_shape
 from tlf_env.physics.state import Motion
 from tlf_env.physics.world import World
 
@@ -122,7 +123,7 @@ class PymunkPlant:
         self._outlines = [next(iter(body.shapes)) for body in self.bodies]
         self._number = {body: i for i, body in enumerate(self.bodies)}
         world = World() if world is None else world
-        self._walls = set(build_statics(space, world))
+        self._walls = set(build_fixed(space, world))
         self._pushed: list[Pushed] = build_pushables(
             space, world, robots[0].gravity_mm_s2, floor=space.static_body
         )
@@ -149,14 +150,15 @@ class PymunkPlant:
         space.remove(*shapes)  # with a shape its contacts go
         for body in space.bodies:
             _take_correction(body)
+            body.force, body.torque = (0.0, 0.0), 0.0
         for body, rest in self._rests.items():
-            body.position, body.angle = rest.position, rest.angle
+            body.angle, body.position = rest.angle, rest.position
             body.velocity, body.angular_velocity = rest.velocity, rest.angular_velocity
         for body, outline, polygon, row in zip(
             self.bodies, self._outlines, self._polygons, self._constants.T.tolist(), strict=True
         ):
             robot = Body(*row)
-            body.mass, body.moment = robot.m, robot.I
+            self._weigh(body, robot)
             if isinstance(outline, pymunk.Circle):
                 outline.unsafe_set_radius(robot.outline_radius)
                 outline.unsafe_set_offset((0.0, robot.outline_ahead))
@@ -170,13 +172,27 @@ class PymunkPlant:
         self._forget_constraints()
         self._moved: set[int] = set()
         self._moved_before: set[int] = set()
-        self._corrections: list[Correction] = []
+        self._corrections: list[tuple[pymunk.Body, Correction]] = []
         self._calm_until = 0  # control step before which no object can be within reach
         self._pulled: set[int] = set()  # robots with forces, constraints or functions of the user's
         self._forces: list[tuple[pymunk.Body, tuple[float, float], float]] = []
         self.hits: dict[
             int, int
         ] = {}  # of a substep: robots, and the type of body that each touched
+
+    def _weigh(self, body: pymunk.Body, robot: Body) -> None:
+        """Give a robot's body its mass and inertia."""
+        body.mass, body.moment = robot.m, robot.I
+
+    @property
+    def pushable_bodies(self) -> list[pymunk.Body]:
+        """The bodies of the world's ``pushables``, in their order."""
+        return [one.body for one in self._pushed]
+
+    @property
+    def moving_bodies(self) -> list[pymunk.Body]:
+        """The bodies of the world's ``moving`` obstacles, in their order."""
+        return [mover.body for mover in self._movers]
 
     @property
     def mover_laps_s(self) -> list[float]:
@@ -189,6 +205,41 @@ class PymunkPlant:
         self._calm_until = 0  # whatever is moved now is seen
         self._settle(motions, step)
         return self._space
+
+    def shapes(self, motions: np.ndarray, step: int) -> list[PlacedShape]:
+        """What is in the space beside the robots' outlines, where it is at a control step; only read.
+
+        ``motions`` (field, robot, 1) are the robots', to whose bodies a user may have added shapes.
+        """
+        poses = {
+            body: (motions[X, i, 0], motions[Y, i, 0], motions[THETA, i, 0])
+            for i, body in enumerate(self.bodies)
+        }
+        for mover in self._movers:
+            poses[mover.body] = (*mover.at(step * self._period_s), mover.body.angle)
+
+        def pose(body: pymunk.Body | None) -> Pose:
+            if body is None:
+                return 0.0, 0.0, 0.0
+            return poses.get(body) or (*body.position, body.angle)
+
+        found = [
+            placed_shape(shape, pose(shape.body))
+            for shape in self._space.shapes
+            if shape not in self._outlines
+        ]
+        found += [
+            placed_link(joint, pose(joint.a), pose(joint.b))
+            for joint in self._space.constraints
+            if joint not in self._floor
+        ]
+        return [one for one in found if one is not None]
+
+    def object_poses(self, step: int) -> np.ndarray:
+        """Pose of each pushed body and then of each moving obstacle at a control step, (object, 3); mm, rad."""
+        rows = [(*one.body.position, one.body.angle) for one in self._pushed]
+        rows += [(*one.at(step * self._period_s), one.body.angle) for one in self._movers]
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
     def _settle(self, motions: np.ndarray, step: int) -> None:
         self._write(motions, motions)
@@ -228,8 +279,6 @@ class PymunkPlant:
         if step < self._calm_until and self._stir() == self._calm:
             return NO_OBJECTS
         space = self._space
-        if any(_is_forced(body) for body in self.bodies):
-            return WITHIN_REACH
         own = {mover.body for mover in self._movers}
         loose = [
             body
@@ -238,6 +287,8 @@ class PymunkPlant:
         ]
         for body in loose:
             self._rests.setdefault(body, _rest(body))
+        if any(_is_forced(body) for body in self.bodies):
+            return WITHIN_REACH
         self._stop_on_floor()
         floor = set(self._floor)
         if any(_is_forced(body, floor) for body in loose):
@@ -327,7 +378,7 @@ class PymunkPlant:
             body.velocity = velocities[V_X, i, 0], velocities[V_Y, i, 0]
             body.angular_velocity = velocities[YAW, i, 0]
 
-    def sort(self, motions: np.ndarray, step: int) -> None:
+    def sort(self, motions: np.ndarray, step: int = 0) -> None:
         """Make the space's index of outlines anew, robot by robot; to be called before a control step.
 
         The order in which Chipmunk solves contacts comes from that index, which otherwise depends on all
@@ -347,7 +398,7 @@ class PymunkPlant:
             for outline in body.shapes:
                 outline.cache_bb()
             body.body_type = pymunk.Body.DYNAMIC
-            body.mass, body.moment = robot.m, robot.I
+            self._weigh(body, robot)
 
     def _hold_forces(self) -> None:
         """Remember the forces on bodies, which Chipmunk forgets after a step, for the whole control step."""
@@ -394,8 +445,7 @@ class PymunkPlant:
         """
         self._write(before, motions)
         self._moved_before, self._moved = self._moved, set()
-        self.hits = {}
-        self._step_space(dt)
+        self._run(dt)
         self._moved |= self._pulled
         for i in self._moved | self._moved_before:
             body = self.bodies[i]
@@ -403,6 +453,14 @@ class PymunkPlant:
             motions[THETA, i, 0] = body.angle
             motions[V_X, i, 0], motions[V_Y, i, 0] = body.velocity
             motions[YAW, i, 0] = body.angular_velocity
+
+    def release(self) -> None:
+        """Called after a control step that ran substep by substep."""
+
+    def _run(self, dt: float) -> None:
+        """A substep of the space, and which robots a contact has moved in it."""
+        self.hits = {}
+        self._step_space(dt)
 
     def _remember(self, arbiter: pymunk.Arbiter, robot: int) -> None:
         self._moved.add(robot)
@@ -424,7 +482,7 @@ class PymunkPlant:
 
         corrected = [
             (body, correction)
-            for body, correction in zip(self._space.bodies, self._corrections, strict=True)
+            for body, correction in self._corrections
             if body.position_func is pymunk.Body.update_position
         ]
         for body, correction in corrected:
@@ -438,7 +496,7 @@ class PymunkPlant:
     def __getstate__(self) -> dict[str, Any]:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
         if not self._corrections:
-            self._corrections = [_take_correction(body) for body in self._space.bodies]
+            self._corrections = [(body, _take_correction(body)) for body in self._space.bodies]
         return {**self.__dict__, "_buffer": None, "_calm": ()}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -508,6 +566,8 @@ def _take_correction(body: pymunk.Body) -> Correction:
 
     pymunk has no property for it. But a body at rest at the origin goes just that far in one second.
     """
+    centre = body.center_of_gravity
+    _move_origin(body, (0.0, 0.0))
     pose, twist = (body.position, body.angle), (body.velocity, body.angular_velocity)
     body.position, body.angle, body.velocity, body.angular_velocity = (
         (0.0, 0.0),
@@ -519,7 +579,14 @@ def _take_correction(body: pymunk.Body) -> Correction:
     correction = Correction(*body.position, body.angle)
     body.position, body.angle = pose
     body.velocity, body.angular_velocity = twist
+    _move_origin(body, centre)
     return correction
+
+
+def _move_origin(body: pymunk.Body, centre: tuple[float, float]) -> None:
+    """Move a body's origin so that its centre of mass, which stays where it is, is at ``centre``."""
+    body.center_of_gravity = centre
+    body.angle = body.angle  # only now does the position follow
 
 
 def _advance_corrected(correction: Correction, body: pymunk.Body, dt: float) -> None:
