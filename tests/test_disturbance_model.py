@@ -163,6 +163,28 @@ PRESETS = {
         "slip.delta_1_mm_s": uniform(-60, 60, 3),
         "slip.delta_2_rad_s": uniform(-0.4, 0.4, 3),
     },
+    "slip-ramps": {
+        "slip.delta_1_mm_s": uniform(-60, 60, 3) | {"ramp_s": 0.2},
+        "slip.delta_2_rad_s": uniform(-0.4, 0.4, 3) | {"ramp_s": 0.2},
+    },
+    "slip-noise": {
+        "slip.delta_1_mm_s": {"type": "band_limited", "std": 30, "correlation_s": 0.5},
+        "slip.delta_2_rad_s": {"type": "band_limited", "std": 0.2, "correlation_s": 0.5},
+    },
+    "slip-sines": {
+        "slip.delta_1_mm_s": {
+            "type": "sine",
+            "amplitude": 40,
+            "frequency_hz": 0.3,
+            "random_phase": True,
+        },
+        "slip.delta_2_rad_s": {
+            "type": "sine",
+            "amplitude": 0.25,
+            "frequency_hz": 0.41,
+            "random_phase": True,
+        },
+    },
     "ice": {"tyre.friction_scale": 0.5},
     "start": {"start.position_std_mm": 80, "start.heading_std_rad": 0.3},
     "payload": {

@@ -145,7 +145,7 @@ def test_a_tyre_creeps_by_its_share_of_load():
 
 
 def test_a_plant_without_creep_says_so():
-    with pytest.raises(ValueError, match="tyre.creep needs 'pymunk' or 'batch'"):
+    with pytest.raises(ValueError, match=r"tyre\.creep needs 'pymunk' or 'batch'"):
         driven(1, tyre={"creep": 0.1}, plant="chipmunk")
 
 

@@ -15,6 +15,7 @@ FORMATION_SETTLE_S = 5.0
 LOST_RMS_MM = 100.0
 LOST_TAIL_FRACTION = 0.3
 SCORE_UNIT_MM = 10.0
+NEAR_MM = 10.0
 SETTLED_MM = 20.0  # settling time: the position error stays below this
 
 
@@ -31,6 +32,7 @@ class RobotMetrics(NamedTuple):
     heading_rmse_rad: float | None
     time_gap_rmse_s: float | None  # followers only
     settling_time_s: float | None  # after it the position error stays below 20 mm
+    time_to_10_mm_s: float | None  # the same for 10 mm
     J_mm_s: float  # eq. (54) at the end
     J_theta_rad_s: float
     torque_rms_Nmm: float
@@ -94,6 +96,7 @@ def robot_metrics(
                 heading_rmse_rad=rms(columns["heading_error_rad"][settled, i]),
                 time_gap_rmse_s=rms(columns["time_gap_error_s"][gapped, i]) if i > 0 else None,
                 settling_time_s=settling_time_s(t_s, error),
+                time_to_10_mm_s=settling_time_s(t_s, error, NEAR_MM),
                 J_mm_s=float(columns["J_mm_s"][-1, i]),
                 J_theta_rad_s=float(columns["J_theta_rad_s"][-1, i]),
                 torque_rms_Nmm=rms(columns["torque_rms_Nmm"][1:, i]) or 0.0,
@@ -121,9 +124,11 @@ def track_errors(columns: Mapping[str, np.ndarray], robot: int) -> tuple[np.ndar
     return -sin * d_x + cos * d_y, cos * d_x + sin * d_y
 
 
-def settling_time_s(t_s: np.ndarray, error: np.ndarray) -> float | None:
-    """The time after which the error stays below 20 mm; None if it does not."""
-    outside = np.flatnonzero(error >= SETTLED_MM)
+def settling_time_s(
+    t_s: np.ndarray, error: np.ndarray, within_mm: float = SETTLED_MM
+) -> float | None:
+    """The time after which the error stays below ``within_mm``; None if it does not."""
+    outside = np.flatnonzero(error >= within_mm)
     if not outside.size:
         return float(t_s[0])
     return float(t_s[outside[-1] + 1]) if outside[-1] + 1 < len(t_s) else None
