@@ -13,6 +13,7 @@ import pytest
 
 import tlf_env
 from baselines import ReferencePolicy
+from tlf_env.physics.pymunk_plant import farthest_point
 
 WALL_Y_MM = 3300.0
 
@@ -290,3 +291,25 @@ def test_a_plant_without_contact_refuses_objects(plant):
     with pytest.raises(ValueError, match=f"plant '{plant}' has no contact: .* need plant 'pymunk'"):
         env.step(still)
     assert np.array_equal(env.state(), before)
+
+
+def test_no_point_of_a_body_is_farther_away_at_any_angle_than_its_bound():
+    body = pymunk.Body(1.0, 1.0)
+    corners = [(-20.0, -10.0), (60.0, -10.0), (0.0, 40.0)]
+    shapes = {
+        math.hypot(30.0, 40.0) + 5.0: pymunk.Circle(body, 5.0, (30.0, 40.0)),
+        13.0 + 2.0: pymunk.Segment(body, (5.0, 12.0), (0.0, 0.0), 2.0),
+        math.hypot(60.0, 10.0): pymunk.Poly(body, corners),
+    }
+    for bound, shape in shapes.items():
+        alone = pymunk.Body(1.0, 1.0)
+        shape.body = alone
+        assert farthest_point(alone) == pytest.approx(bound)
+        reached = 0.0
+        for angle in np.linspace(0.0, 2.0 * math.pi, 721):
+            alone.angle = angle
+            box = shape.cache_bb()
+            reached = max(reached, *map(abs, box))
+        assert reached == pytest.approx(bound, rel=1e-4)
+    alone.center_of_gravity = (3.0, 4.0)
+    assert farthest_point(alone) == pytest.approx(bound + 5.0)

@@ -187,6 +187,8 @@ env.space.add(
 - A dynamic body that you add slides without friction on the floor. A `PivotJoint` and a `GearJoint` to
   `space.static_body`, with `max_bias` 0 and a `max_force`, are floor friction; a body in the scenario's
   `pushables` has both.
+- Leave the space's own `gravity` and `damping` at 0 and 1: on a robot they would act only while something is
+  near. Use forces instead.
 - Robots get their places from the engine: to move a robot, use the option `poses` of `reset`; a position
   written to its body has no effect.
 - After moving a static shape by hand, call `env.space.reindex_shape(shape)`, and read `env.space` again, so
