@@ -20,9 +20,9 @@ from pymunk.batch import BodyFields, Buffer, get_space_bodies
 from tlf_env.physics.objects import (
     Mover,
     Pushed,
+    build_fixed,
     build_movers,
     build_pushables,
-    build_statics,
     damped_velocity,
 )
 from tlf_env.physics.parameters import Body, RobotParameters, body_array
@@ -123,7 +123,7 @@ class PymunkPlant:
         self._outlines = [next(iter(body.shapes)) for body in self.bodies]
         self._number = {body: i for i, body in enumerate(self.bodies)}
         world = World() if world is None else world
-        self._walls = set(build_statics(space, world))
+        self._walls = set(build_fixed(space, world))
         self._pushed: list[Pushed] = build_pushables(
             space, world, robots[0].gravity_mm_s2, floor=space.static_body
         )
