@@ -78,6 +78,33 @@ def test_a_wall_across_the_path_stops_the_leader():
     assert infos["robot_0"]["touched"]
 
 
+@pytest.mark.parametrize("what", ["wall of the world", "wall", "box", "robot"])
+def test_a_bar_on_a_robot_meets_what_the_outline_does_not(what):
+    """A bar that a user fixes to a robot, 300 mm ahead of its centre of mass."""
+    line = {"points_mm": [[-300.0, 700.0], [300.0, 700.0]], "thickness_mm": 10.0}
+    world = {"walls": [line]} if what == "wall of the world" else {}
+    env = environment(robots=2, disturbance="none", world=world)
+    other = [0.0, 830.0, 0.0] if what == "robot" else [2000.0, 0.0, 0.0]
+    env.reset(seed=0, options={"poses": [[0.0, 0.0, 0.0], other]})
+    if what == "wall":
+        wall(env, *line["points_mm"])
+    pushed = box(env, (0.0, 775.0)) if what == "box" else None
+    env.space.add(pymunk.Segment(env.robot_bodies["robot_0"], (0, 100), (0, 300), 5))
+    for _ in range(200):
+        *_, infos = env.step({"robot_0": np.array([0.2, 0.0]), "robot_1": np.zeros(2)})
+    tip = infos["robot_0"]["y_mm"] - env.scenario.robot.com_offset_mm + 305.0
+    if what == "box":
+        assert pushed.position.y - 75.0 > tip - 1.0
+        assert pushed.position.y > 800.0
+        assert infos["robot_0"]["touched_by"] == tlf_env.TouchedBy.NOTHING
+    elif what == "robot":
+        assert infos["robot_0"]["touched_by"] == tlf_env.TouchedBy.ROBOT
+        assert infos["robot_1"]["y_mm"] - 140.0 > tip - 1.0
+    else:
+        assert tip < 696.0
+        assert infos["robot_0"]["touched_by"] == tlf_env.TouchedBy.WALL
+
+
 def test_touching_a_wall_ends_the_episode():
     env = environment(end_on=("touched",))
     env.reset(seed=0)

@@ -176,7 +176,8 @@ env.space.add(
 ```
 
 - A robot that meets a static or kinematic shape (a wall, a moving obstacle) is `touched`, as by another robot,
-  and `touched_by` says which. A dynamic body (a box) can be pushed, and is not counted.
+  and `touched_by` says which. A dynamic body (a box) can be pushed, and is not counted. Shapes that you add to
+  a robot's body (a bar, a gripper) belong to its outline.
 - A contact has the product of both shapes' `friction` and `elasticity`. Those of the robots are
   `outline_friction` and `outline_restitution`, 0 by default; those of a new pymunk shape are 0, too.
 - Constraints, such as a [rope to a trailer](../examples/trailer_on_a_rope.py), and

@@ -317,18 +317,24 @@ class PymunkPlant:
         """
         space, period_s = self._space, self._period_s
         calm_s = MOST_CALM_S
-        for body, outline in zip(self.bodies, self._outlines, strict=True):
-            speed = _fastest_point(body) + fastest
+        speeds = [_fastest_point(body) for body in self.bodies]
+        for body, outline, own_speed in zip(self.bodies, self._outlines, speeds, strict=True):
+            # The compiled laws know of outlines and walls, but not of shapes that a user adds to a robot.
+            enlarged = len(body.shapes) > 1
+            speed = own_speed + (max([fastest, *speeds]) if enlarged else fastest)
             box = outline.cache_bb()
             centre = ((box.left + box.right) / 2, (box.bottom + box.top) / 2)
             size = math.hypot(box.right - box.left, box.top - box.bottom) / 2
             if isinstance(outline, pymunk.Circle):
                 size = outline.radius
+            if enlarged:
+                centre, size = (body.position.x, body.position.y), farthest_point(body)
             room = CLOSE_MARGIN_MM + (speed + 2.0 * FASTEST_CHANGE_MM_S2 * period_s) * period_s
             wide = size + CLOSE_MARGIN_MM + way(speed, MOST_CALM_S)
             near = pymunk.BB(centre[0] - wide, centre[1] - wide, centre[0] + wide, centre[1] + wide)
             for shape in space.bb_query(near, pymunk.ShapeFilter()):
-                if shape.body in self._number or shape in self._walls:
+                known = shape.body in self._number or shape in self._walls
+                if shape.body is body or (known and not enlarged):
                     continue
                 apart = shape.point_query(centre).distance - size
                 if apart <= room:
