@@ -148,8 +148,9 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     def space(self) -> pymunk.Space:
         """The pymunk space, with its bodies at the present poses of the robots; mm, s, kg.
 
-        Shapes, bodies and constraints that you add take part from the next :meth:`step` on, on the plant
-        ``pymunk``. :meth:`reset` keeps them, and puts bodies back to where the first step found them.
+        Shapes, bodies and constraints that you add take part from the next :meth:`step` on, on the plants
+        ``pymunk`` and ``chipmunk``. :meth:`reset` keeps them, and puts bodies back to where the first step
+        found them.
         """
         return self._formation.space
 

@@ -154,7 +154,7 @@ state, for critics.
 ## Objects in the space
 
 Walls, obstacles, bodies to push and moving obstacles are fields of a scenario: [world.md](world.md). What it
-has no field for is added to the space. On the plant `pymunk` (the default), `env.space` is a
+has no field for is added to the space. On the plants `pymunk` (the default) and `chipmunk`, `env.space` is a
 [pymunk](https://www.pymunk.org) space in mm, s and kg (forces in mN), `env.robot_bodies` contains the robots'
 bodies in it, and `env.pushable_bodies` and `env.moving_bodies` those of the scenario's world. (With
 `gymnasium.make`, `env.unwrapped.formation_env` has them.) What you add takes part from the next step on:
@@ -181,7 +181,8 @@ env.space.add(
 - A contact has the product of both shapes' `friction` and `elasticity`. Those of the robots are
   `outline_friction` and `outline_restitution`, 0 by default; those of a new pymunk shape are 0, too.
 - Constraints, such as a [rope to a trailer](../examples/trailer_on_a_rope.py), and
-  [forces](../examples/user_force.py) act on robots; the wheels answer one substep later. A force
+  [forces](../examples/user_force.py) act on robots; the wheels answer one substep later, on `chipmunk` in the
+  same one. (There `env.robot_bodies` are the chassis alone: [chipmunk.md](chipmunk.md).) A force
   (`body.apply_force_at_world_point`) acts through the whole next control step and is then 0: apply it before
   each step. A constraint's `impulse` is that of the last substep: divided by `physics_period_s`, it is the
   force.

@@ -154,13 +154,13 @@ class PymunkPlant:
             _take_correction(body)
             body.force, body.torque = (0.0, 0.0), 0.0
         for body, rest in self._rests.items():
-            body.position, body.angle = rest.position, rest.angle
+            body.angle, body.position = rest.angle, rest.position
             body.velocity, body.angular_velocity = rest.velocity, rest.angular_velocity
         for body, outline, polygon, row in zip(
             self.bodies, self._outlines, self._polygons, self._constants.T.tolist(), strict=True
         ):
             robot = Body(*row)
-            body.mass, body.moment = robot.m, robot.I
+            self._weigh(body, robot)
             if isinstance(outline, pymunk.Circle):
                 outline.unsafe_set_radius(robot.outline_radius)
                 outline.unsafe_set_offset((0.0, robot.outline_ahead))
@@ -174,13 +174,17 @@ class PymunkPlant:
         self._forget_constraints()
         self._moved: set[int] = set()
         self._moved_before: set[int] = set()
-        self._corrections: list[Correction] = []
+        self._corrections: list[tuple[pymunk.Body, Correction]] = []
         self._calm_until = 0  # control step before which no object can be within reach
         self._pulled: set[int] = set()  # robots with forces, constraints or functions of the user's
         self._forces: list[tuple[pymunk.Body, tuple[float, float], float]] = []
         self.hits: dict[
             int, int
         ] = {}  # of a substep: robots, and the type of body that each touched
+
+    def _weigh(self, body: pymunk.Body, robot: Body) -> None:
+        """Give a robot's body its mass and inertia."""
+        body.mass, body.moment = robot.m, robot.I
 
     @property
     def pushable_bodies(self) -> list[pymunk.Body]:
@@ -387,7 +391,7 @@ class PymunkPlant:
             body.velocity = velocities[V_X, i, 0], velocities[V_Y, i, 0]
             body.angular_velocity = velocities[YAW, i, 0]
 
-    def sort(self, motions: np.ndarray, step: int) -> None:
+    def sort(self, motions: np.ndarray, step: int = 0) -> None:
         """Make the space's index of outlines anew, robot by robot; to be called before a control step.
 
         The order in which Chipmunk solves contacts comes from that index, which otherwise depends on all
@@ -407,7 +411,7 @@ class PymunkPlant:
             for outline in body.shapes:
                 outline.cache_bb()
             body.body_type = pymunk.Body.DYNAMIC
-            body.mass, body.moment = robot.m, robot.I
+            self._weigh(body, robot)
 
     def _hold_forces(self) -> None:
         """Remember the forces on bodies, which Chipmunk forgets after a step, for the whole control step."""
@@ -455,8 +459,7 @@ class PymunkPlant:
         """
         self._write(before, motions)
         self._moved_before, self._moved = self._moved, set()
-        self.hits = {}
-        self._step_space(dt)
+        self._run(dt)
         self._moved |= self._pulled
         for i in self._moved | self._moved_before:
             body = self.bodies[i]
@@ -464,6 +467,14 @@ class PymunkPlant:
             motions[THETA, i, 0] = body.angle
             motions[V_X, i, 0], motions[V_Y, i, 0] = body.velocity
             motions[YAW, i, 0] = body.angular_velocity
+
+    def release(self) -> None:
+        """Called after a control step that ran substep by substep."""
+
+    def _run(self, dt: float) -> None:
+        """A substep of the space, and which robots a contact has moved in it."""
+        self.hits = {}
+        self._step_space(dt)
 
     def _remember(self, arbiter: pymunk.Arbiter, robot: int) -> None:
         self._moved.add(robot)
@@ -485,7 +496,7 @@ class PymunkPlant:
 
         corrected = [
             (body, correction)
-            for body, correction in zip(self._space.bodies, self._corrections, strict=True)
+            for body, correction in self._corrections
             if body.position_func is pymunk.Body.update_position
         ]
         for body, correction in corrected:
@@ -499,7 +510,7 @@ class PymunkPlant:
     def __getstate__(self) -> dict[str, Any]:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
         if not self._corrections:
-            self._corrections = [_take_correction(body) for body in self._space.bodies]
+            self._corrections = [(body, _take_correction(body)) for body in self._space.bodies]
         return {**self.__dict__, "_buffer": None, "_calm": (), "_sizes": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -584,6 +595,8 @@ def _take_correction(body: pymunk.Body) -> Correction:
 
     pymunk has no property for it. But a body at rest at the origin goes just that far in one second.
     """
+    centre = body.center_of_gravity
+    _move_origin(body, (0.0, 0.0))
     pose, twist = (body.position, body.angle), (body.velocity, body.angular_velocity)
     body.position, body.angle, body.velocity, body.angular_velocity = (
         (0.0, 0.0),
@@ -595,7 +608,14 @@ def _take_correction(body: pymunk.Body) -> Correction:
     correction = Correction(*body.position, body.angle)
     body.position, body.angle = pose
     body.velocity, body.angular_velocity = twist
+    _move_origin(body, centre)
     return correction
+
+
+def _move_origin(body: pymunk.Body, centre: tuple[float, float]) -> None:
+    """Move a body's origin so that its centre of mass, which stays where it is, is at ``centre``."""
+    body.center_of_gravity = centre
+    body.angle = body.angle  # only now does the position follow
 
 
 def _advance_corrected(correction: Correction, body: pymunk.Body, dt: float) -> None:

@@ -130,7 +130,9 @@ class Scenario(Frozen):
     physics_period_s: Positive = 0.001
     control_period_s: Positive = DEFAULT_CONTROL_PERIOD_S
     horizon_s: Positive = 100.0
-    plant: Literal["pymunk", "batch", "kinematic"] = "pymunk"
+    # What moves the robots: `pymunk` is the exact kernel, with contact in a pymunk space; `batch` the kernel
+    # alone; `kinematic` the wheels' commands; `chipmunk` pymunk's own bodies and constraints.
+    plant: Literal["pymunk", "batch", "kinematic", "chipmunk"] = "pymunk"
     world: World = World()
 
     wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
@@ -297,6 +299,10 @@ class Scenario(Frozen):
             raise ValueError(f"{role} {path!r} is a Python object, which cannot run in a batch")
         if self.adversary:
             raise ValueError("adversary True cannot be used with plant 'batch'")
+        if self.plant == "chipmunk":
+            raise ValueError(
+                "plant 'chipmunk' moves one formation at a time; 'batch' and 'kinematic' can run in a batch"
+            )
 
     @property
     def robot_count(self) -> int:
