@@ -132,6 +132,8 @@ class PymunkPlant:
         self._rests: dict[pymunk.Body, Rest] = {one.body: _rest(one.body) for one in self._pushed}
         self._shared = False  # whether a user has had the space
         self._buffer = Buffer()
+        # Half the thickness and the farthest point of bodies, mm; found once per control step.
+        self._sizes: dict[pymunk.Body, tuple[float, float]] = {}
         self._calm: tuple[Any, ...] = ()
         self.reset()
 
@@ -319,18 +321,24 @@ class PymunkPlant:
         """
         space, period_s = self._space, self._period_s
         calm_s = MOST_CALM_S
-        for body, outline in zip(self.bodies, self._outlines, strict=True):
-            speed = _fastest_point(body) + fastest
+        speeds = [_fastest_point(body) for body in self.bodies]
+        for body, outline, own_speed in zip(self.bodies, self._outlines, speeds, strict=True):
+            # The compiled laws know of outlines and walls, but not of shapes that a user adds to a robot.
+            enlarged = len(body.shapes) > 1
+            speed = own_speed + (max([fastest, *speeds]) if enlarged else fastest)
             box = outline.cache_bb()
             centre = ((box.left + box.right) / 2, (box.bottom + box.top) / 2)
             size = math.hypot(box.right - box.left, box.top - box.bottom) / 2
             if isinstance(outline, pymunk.Circle):
                 size = outline.radius
+            if enlarged:
+                centre, size = (body.position.x, body.position.y), farthest_point(body)
             room = CLOSE_MARGIN_MM + (speed + 2.0 * FASTEST_CHANGE_MM_S2 * period_s) * period_s
             wide = size + CLOSE_MARGIN_MM + way(speed, MOST_CALM_S)
             near = pymunk.BB(centre[0] - wide, centre[1] - wide, centre[0] + wide, centre[1] + wide)
             for shape in space.bb_query(near, pymunk.ShapeFilter()):
-                if shape.body in self._number or shape in self._walls:
+                known = shape.body in self._number or shape in self._walls
+                if shape.body is body or (known and not enlarged):
                     continue
                 apart = shape.point_query(centre).distance - size
                 if apart <= room:
@@ -358,8 +366,13 @@ class PymunkPlant:
         """A step of the space, in parts if a body would move far compared with its thickness."""
         farthest = 0.0
         for body in self._space.bodies:
-            if body.shapes and not _is_still(body):
-                farthest = max(farthest, _fastest_point(body) * dt / half_thickness(body))
+            if _is_still(body) or not body.shapes:
+                continue
+            if body not in self._sizes:
+                self._sizes[body] = half_thickness(body), farthest_point(body)
+            half, radius = self._sizes[body]
+            speed = body.velocity.length + abs(body.angular_velocity) * radius
+            farthest = max(farthest, speed * dt / half)
         parts = min(max(1, math.ceil(farthest / LARGEST_MOVE)), MOST_SPLITS)
         for _ in range(parts):
             for body, force, torque in self._forces:
@@ -408,6 +421,7 @@ class PymunkPlant:
             if body.force != (0.0, 0.0) or body.torque
         ]
         self._pulled = {i for i, body in enumerate(self.bodies) if _is_forced(body)}
+        self._sizes.clear()
 
     def _forget_constraints(self) -> None:
         """Set the impulses that constraints remember to 0; to be called before a control step.
@@ -497,7 +511,7 @@ class PymunkPlant:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
         if not self._corrections:
             self._corrections = [(body, _take_correction(body)) for body in self._space.bodies]
-        return {**self.__dict__, "_buffer": None, "_calm": ()}
+        return {**self.__dict__, "_buffer": None, "_calm": (), "_sizes": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _buffer=Buffer())
@@ -516,6 +530,21 @@ def _half_width(shape: pymunk.Shape) -> float:
         heights = np.ptp(corners @ normals, axis=0)
         return float(heights.min()) / 2 + shape.radius
     return float(shape.radius) if isinstance(shape, pymunk.Circle | pymunk.Segment) else 0.0
+
+
+def farthest_point(body: pymunk.Body) -> float:
+    """A bound on the distance of all points of a body's shapes from its centre of mass, mm."""
+    return max(map(_farthest_of, body.shapes)) + body.center_of_gravity.length
+
+
+def _farthest_of(shape: pymunk.Shape) -> float:
+    if isinstance(shape, pymunk.Circle):
+        return float(shape.offset.length + shape.radius)
+    if isinstance(shape, pymunk.Segment):
+        return float(max(shape.a.length, shape.b.length) + shape.radius)
+    if isinstance(shape, pymunk.Poly):
+        return float(max(corner.length for corner in shape.get_vertices()) + shape.radius)
+    return 0.0
 
 
 def _rest(body: pymunk.Body) -> Rest:
