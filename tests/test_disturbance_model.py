@@ -6,7 +6,7 @@ import re
 import numpy as np
 import pytest
 import yaml
-from disturbance_helpers import DOCS, GAP_S, ONE_LINE, SHOWS, environment, rest, run, tree
+from disturbance_helpers import DOCS, GAP_S, NEEDS, ONE_LINE, SHOWS, environment, rest, run, tree
 
 from baselines import ReferencePolicy
 from tlf_env.common.presets import preset_names, presets_folder
@@ -51,8 +51,12 @@ def test_an_adversary_sets_channels_for_each_step(disturbance):
 
 @pytest.mark.parametrize("path", SET_WITHIN_EPISODE)
 def test_an_adversary_does_what_the_channel_does(path):
+    beside = NEEDS.get(path, {})
     imposed = parallel_env(
-        "infinity", adversary=lambda env: {path: SHOWS[path]}, end_on=(), time_gap_s=GAP_S
+        "infinity",
+        adversary=lambda env: beside | {path: SHOWS[path]},
+        end_on=(),
+        time_gap_s=GAP_S,
     )
     policy = ReferencePolicy()
     seen, _ = imposed.reset(seed=0)
@@ -60,7 +64,7 @@ def test_an_adversary_does_what_the_channel_does(path):
         seen = imposed.step({agent: policy.predict(row)[0] for agent, row in seen.items()})[0]
     # the first message and the first previews are out before the first step
     apart = 0.0 if not path.startswith("radio.") else 20.0
-    same = run({path: SHOWS[path]}, seconds=2.0, horizon_s=100.0)
+    same = run({**beside, path: SHOWS[path]}, seconds=2.0, horizon_s=100.0)
     assert imposed.formation.state() == pytest.approx(same.formation.state(), abs=apart)
     assert (same.formation.state() != run(seconds=2.0, horizon_s=100.0).formation.state()).any()
 

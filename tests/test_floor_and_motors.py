@@ -71,10 +71,13 @@ def test_a_robot_across_a_slope_holds_up_to_static_friction_and_slides_beyond():
     assert np.abs(held[-1, :3]).max() < 1e-3
     slope = 0.12
     rows = driven(25, floor={"slope_rad": slope, "uphill_rad": across})
-    expected = G * (math.sin(slope) - ROBOT.tyre.mu_dynamic * math.cos(slope))
     speed = (rows[-1, 0] - rows[-2, 0]) / PERIOD_S
-    # The tyres let go above their stiction speed only, so the speed is slightly less.
-    assert speed == pytest.approx(expected * 0.49, rel=0.03)
+    # Between all three tyres and the drive wheels' alone: the castor swings and rubs less than it could.
+    least, most = (
+        G * (math.sin(slope) - share * ROBOT.tyre.mu_dynamic * math.cos(slope))
+        for share in (1, 0.8)
+    )
+    assert 0.97 * least < speed / 0.49 < most
 
 
 @pytest.mark.parametrize("plant", ["pymunk", "batch", "chipmunk"])
