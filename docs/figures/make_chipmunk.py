@@ -189,10 +189,10 @@ class UnsharedPlant(ChipmunkPlant):
 class KeptPlant(ChipmunkPlant):
     """All constraints are made once, and remember their impulses during the whole run."""
 
-    def sort(self, motions: np.ndarray, *args: Any) -> None:
+    def sort(self, motions: np.ndarray, step: int = 0) -> None:
         """Only once."""
         if not self._robots[0].constraints:
-            super().sort(motions, *args)
+            super().sort(motions, step)
 
     def release(self) -> None:
         """Never."""
