@@ -451,6 +451,7 @@ def test_a_world_has_walls_things_to_push_and_moving_obstacles():
                 "mass_kg": 0.5,
                 "x_mm": 0.0,
                 "y_mm": 220.0,
+                "floor_friction": 0.02,
             }
         ],
     }
