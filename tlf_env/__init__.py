@@ -15,7 +15,7 @@ import pettingzoo
 if TYPE_CHECKING:
     from tlf_env.engine.batch import BatchPlant
     from tlf_env.envs.parallel import aec_env, parallel_env
-    from tlf_env.task.info import EndReason
+    from tlf_env.task.info import EndReason, TouchedBy
     from tlf_env.task.scenario import Scenario, load_scenario
 
 __version__ = "0.1.0"
@@ -23,6 +23,7 @@ __all__ = [
     "BatchPlant",
     "EndReason",
     "Scenario",
+    "TouchedBy",
     "__version__",
     "aec_env",
     "load_scenario",
@@ -32,6 +33,7 @@ __all__ = [
 _MODULES = {
     "BatchPlant": "tlf_env.engine.batch",
     "EndReason": "tlf_env.task.info",
+    "TouchedBy": "tlf_env.task.info",
     "aec_env": "tlf_env.envs.parallel",
     "parallel_env": "tlf_env.envs.parallel",
     "Scenario": "tlf_env.task.scenario",

@@ -20,6 +20,7 @@ KINDS = {
     "scenario": "",
     "disturbance": "disturbances",
     "controller": "controllers",
+    "world": "worlds",
     "plan": "plans",
     "training": "train",
     "search": "tune",

@@ -17,6 +17,8 @@ ENCODER_NOISE = 3
 RADIO_JITTER = 4
 RADIO_DROPOUT = 5
 MIXTURE = 6
+MOVING_OBSTACLE = 7
+RAYS = 8
 
 Rate = Literal["substep", "control step", "episode"]
 SUBSTEP: Rate = "substep"  # acts in the plant and the sensors, so it is evaluated in every substep

@@ -7,18 +7,19 @@ Nominal is the paper's: noise of the position fixes of 0.2 mm² variance and not
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import BaseModel, BeforeValidator, model_validator
 from pydantic_core import PydanticCustomError
 
-from tlf_env.common.models import Frozen, NonNegative, Number, Positive, is_number
+from tlf_env.common.models import Frozen, NonNegative, is_number
 from tlf_env.disturbances.channels import CHANNELS, PATHS, SUBSTEP, number, numbers
 from tlf_env.disturbances.signals import Constant, Signal
 from tlf_env.numerics.compiled import law
 from tlf_env.physics.vehicle import Body, Motion
+from tlf_env.physics.world import Patch
 
 
 def _plain_number(value: Any) -> Any:
@@ -41,15 +42,6 @@ class SlipChannels(Frozen):
 
     delta_1_mm_s: ChannelSignal = _nominal("slip.delta_1_mm_s")
     delta_2_rad_s: ChannelSignal = _nominal("slip.delta_2_rad_s")
-
-
-class Patch(Frozen):
-    """A disc on the floor where the tyres' friction is scaled."""
-
-    x_mm: Number
-    y_mm: Number
-    radius_mm: Positive
-    friction_scale: NonNegative
 
 
 class TyreChannels(Frozen):
@@ -176,11 +168,15 @@ def signal_rows(disturbance: Disturbance, dt_s: float, control_period_s: float) 
     )
 
 
-def patch_rows(disturbance: Disturbance) -> np.ndarray:
-    """The compiled patches, (patch, :class:`PatchRow`), the level on their deviation from 1."""
+def patch_rows(disturbance: Disturbance, floor: Sequence[Patch] = ()) -> np.ndarray:
+    """The compiled patches, (patch, :class:`PatchRow`): the disturbance's, then those of the world's floor.
+
+    The disturbance's level acts on its own patches only: on their deviation from 1.
+    """
     rows = [
-        PatchRow(p.x_mm, p.y_mm, p.radius_mm, leveled(1.0, p.friction_scale, disturbance.level))
-        for p in disturbance.tyre.patches
+        PatchRow(p.x_mm, p.y_mm, p.radius_mm, leveled(1.0, p.friction_scale, level))
+        for patches, level in ((disturbance.tyre.patches, disturbance.level), (floor, 1.0))
+        for p in patches
     ]
     return np.array(rows, dtype=np.float64).reshape(-1, len(PatchRow._fields))
 

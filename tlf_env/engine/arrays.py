@@ -28,6 +28,7 @@ from tlf_env.onboard.observer import Message, Reference
 from tlf_env.onboard.slip_estimator import slip_ekf_constants
 from tlf_env.onboard.wheel_loop import WheelLoopParameters, digital_wheel_loop
 from tlf_env.physics.vehicle import Floor, body
+from tlf_env.physics.world import capsule_rows
 from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
 from tlf_env.task.info import Info
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
@@ -58,6 +59,7 @@ class Arrays(NamedTuple):
     # constants of the variants
     signals: np.ndarray  # (variant, channel, SignalRow)
     patches: np.ndarray  # (variant, patch, PatchRow)
+    walls: np.ndarray  # (capsule, Capsule): the static world
     tables: np.ndarray  # (table, step, Reference): the leader's reference at the control steps
     # constants of an episode
     variants: np.ndarray  # (lane,) int64
@@ -96,6 +98,8 @@ class Arrays(NamedTuple):
     touched: np.ndarray
     lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
     touched_now: np.ndarray
+    touched_by: np.ndarray  # (lane, robot) int8: what was touched first, a TouchedBy
+    calm: np.ndarray  # (lane,) int64: the control step before which no robot can meet a wall
     ends: np.ndarray  # (lane, robot) int8: why the episode ended in this step, an EndReason
     scales: np.ndarray  # (entry,) of `tracking`
     sensor_scales: np.ndarray  # (entry,) of `sensor`
@@ -157,7 +161,7 @@ def make_constants(scenario: Scenario) -> np.ndarray:
 
 def _all_patches(scenarios: Sequence[Scenario]) -> np.ndarray:
     """Patches as (variant, patch, PatchRow), filled up with patches that no robot is ever on."""
-    rows = [patch_rows(scenario.disturbance) for scenario in scenarios]
+    rows = [patch_rows(one.disturbance, one.world.patches) for one in scenarios]
     out = np.tile(np.array(FAR_AWAY), (len(rows), max(map(len, rows)), 1))
     for patches, some in zip(out, rows, strict=True):
         patches[: len(some)] = some
@@ -229,6 +233,7 @@ def make_arrays(
             ]
         ),
         patches=_all_patches(scenarios),
+        walls=capsule_rows(scenario.world),
         tables=table[None].copy(),
         variants=np.arange(lanes) % len(scenarios),
         routes=np.zeros(lanes, dtype=np.int64),
@@ -263,6 +268,8 @@ def make_arrays(
         touched=np.zeros((lanes, robots), dtype=np.bool_),
         lost_now=np.zeros((lanes, robots), dtype=np.bool_),
         touched_now=np.zeros((lanes, robots), dtype=np.bool_),
+        touched_by=np.zeros((lanes, robots), dtype=np.int8),
+        calm=np.zeros(lanes, dtype=np.int64),
         ends=np.zeros((lanes, robots), dtype=np.int8),
         scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
         sensor_scales=np.array(

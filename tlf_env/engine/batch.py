@@ -310,6 +310,11 @@ class BatchPlant:
         return self.arrays.touched
 
     @property
+    def touched_by(self) -> np.ndarray:
+        """(formations, robots) int8 of :class:`~tlf_env.TouchedBy`: what each touched first."""
+        return self.arrays.touched_by
+
+    @property
     def lost_now(self) -> np.ndarray:
         """(formations, robots) bool, for the first time in this step."""
         return self.arrays.lost_now

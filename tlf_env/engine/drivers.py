@@ -35,13 +35,14 @@ from tlf_env.engine.judging import (
     record_truth,
 )
 from tlf_env.engine.layout import Trace, WheelPair, in_array
-from tlf_env.engine.outlines import mark_touched, room_to_move
+from tlf_env.engine.outlines import away_from_walls, mark_touched, room_to_move, touch
 from tlf_env.engine.radio import broadcast, delayed_message, next_reference
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.starting import STARTED, clear, start_lane
 from tlf_env.engine.substeps import trace_drive
 from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import block, driver, fetch_add, law
+from tlf_env.numerics.philox import unit, words
 from tlf_env.onboard.observer import Message
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 from tlf_env.task.actions import (
@@ -204,6 +205,19 @@ def delayed_message_of(
 
 
 @driver
+def mark(arrays: Arrays, lane: int, robot: int, thing: int) -> None:
+    """:func:`touch`, for what the space finds."""
+    touch(arrays, lane, robot, thing)
+
+
+@driver
+def uniform(seed: int, stream: int, number: int, episode: int) -> float:
+    """A random number in [0, 1), for draws outside."""
+    word, _, _, _ = words(seed, stream, number, episode, 0)
+    return unit(word)
+
+
+@driver
 def delays_of(arrays: Arrays, lane: int, robot: int, dt: float) -> tuple[int, int]:
     """:func:`delays`, for wheel loops outside."""
     return delays(arrays, lane, robot, dt)
@@ -252,13 +266,14 @@ def refer(arrays: Arrays, lane: int, first: int, last: int, settings: Settings) 
 
 @block
 def find_near(arrays: Arrays, first: int, last: int, near: np.ndarray, settings: Settings) -> None:
-    """Mark the lanes from ``first`` on whose outlines could meet within the control step.
+    """Mark the lanes from ``first`` on whose outlines could meet, or a wall, within the control step.
 
     Without torques only its end counts.
     """
     for lane in range(first, last):
-        near[lane - first] = not settings.kinematic and not room_to_move(
-            arrays, lane, settings.period
+        near[lane - first] = not settings.kinematic and not (
+            away_from_walls(arrays, lane, settings.period)
+            and room_to_move(arrays, lane, settings.period)
         )
 
 
@@ -290,7 +305,8 @@ def account(arrays: Arrays, lane: int, settings: Settings) -> None:
 def sense(arrays: Arrays, lane: int, substep: int, settings: Settings) -> None:
     """The second half of a substep of a lane: sensors and estimator, and which outlines meet."""
     advance(arrays, np.full(1, lane), substep, substep + 1, False, True, settings)
-    mark_touched(arrays, lane)
+    if settings.round_outlines:
+        mark_touched(arrays, lane)
 
 
 @block

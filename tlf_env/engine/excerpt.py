@@ -21,11 +21,11 @@ class Excerpt(NamedTuple):
     observations: np.ndarray  # (lane, entry); (0, entry) if nothing is to be written
 
 
-# Rows: those of INFO_KEYS (Info, the reward terms, the channels, three flags), then the reward.
+# Rows: those of INFO_KEYS (Info, the reward terms, the channels, the flags), then the reward.
 TERMS_ROW = len(Info._fields)
 APPLIED_ROW = TERMS_ROW + len(RewardTerms._fields)
 LOST_ROW = APPLIED_ROW + len(CHANNELS)
-TOUCHED_ROW, END_ROW, REWARD_ROW = range(LOST_ROW + 1, LOST_ROW + 4)
+TOUCHED_ROW, TOUCHED_BY_ROW, END_ROW, REWARD_ROW = range(LOST_ROW + 1, LOST_ROW + 5)
 
 
 def empty_excerpt(arrays: Arrays, robot: int, lanes: int) -> Excerpt:
@@ -60,6 +60,7 @@ def write_excerpt(arrays: Arrays, first: int, last: int, out: Excerpt) -> None:
             numbers[TERMS_ROW + i, lane] = arrays.terms[lane, robot, i]
         numbers[LOST_ROW, lane] = arrays.lost[lane, robot]
         numbers[TOUCHED_ROW, lane] = arrays.touched[lane, robot]
+        numbers[TOUCHED_BY_ROW, lane] = arrays.touched_by[lane, robot]
         numbers[END_ROW, lane] = arrays.ends[lane, robot]
         numbers[REWARD_ROW, lane] = arrays.rewards[lane, robot]
     for i in range(LOST_ROW - APPLIED_ROW):

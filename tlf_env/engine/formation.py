@@ -11,6 +11,7 @@ import pymunk
 from tlf_env.common.errors import shown
 from tlf_env.disturbances.channels import (
     CHANNELS,
+    MOVING_OBSTACLE,
     PAYLOAD_BEHIND,
     PAYLOAD_MASS,
     SET_WITHIN_EPISODE,
@@ -23,7 +24,7 @@ from tlf_env.engine.excerpt import empty_excerpt
 from tlf_env.engine.layout import Traction, rows_of
 from tlf_env.engine.outside_parts import Parts, part_factories
 from tlf_env.engine.settings import make_settings
-from tlf_env.engine.starting import OFF_BASE, START_ATTEMPTS, STARTED
+from tlf_env.engine.starting import IN_WALL, OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.parts import Factory, real_numbers
 from tlf_env.physics.chipmunk_plant import ChipmunkPlant
@@ -34,7 +35,7 @@ from tlf_env.physics.pymunk_plant import (
     PymunkPlant,
 )
 from tlf_env.physics.vehicle import Body
-from tlf_env.task.info import Info
+from tlf_env.task.info import Info, TouchedBy
 from tlf_env.task.scenario import Scenario
 from tlf_env.task.start import Start
 from tlf_env.task.trajectories import sample
@@ -63,6 +64,12 @@ def state_dtype(scenario: Scenario, path: np.ndarray) -> np.dtype:
     return np.dtype(np.float64 if exact else np.float32)
 
 
+# What a body in the space is that a robot touched, by its type.
+TOUCHED_BY = {
+    pymunk.Body.DYNAMIC: int(TouchedBy.ROBOT),
+    pymunk.Body.STATIC: int(TouchedBy.WALL),
+    pymunk.Body.KINEMATIC: int(TouchedBy.OBSTACLE),
+}
 USUAL_START = Start(poses=None, phases_s=None)
 ALONE = np.ones(1, dtype=np.bool_)
 NO_POSES = np.zeros((0, 0, 3))
@@ -83,7 +90,7 @@ class Formation:
         self.arrays: Arrays = make_arrays([scenario], self._table)
         self._variants = make_variants([scenario])
         kind = ChipmunkPlant if scenario.plant == "chipmunk" else PymunkPlant
-        self.plant = kind(list(scenario.robot_models))
+        self.plant = kind(scenario.robot_models, scenario.world, scenario.control_period_s)
         self._parts = Parts(part_factories(scenario, parts or {}), scenario)
         self._settings = make_settings(scenario)
         self._left = drivers.lanes_to_step(0, 1)
@@ -102,7 +109,7 @@ class Formation:
     @property
     def space(self) -> pymunk.Space:
         """The pymunk space with the bodies where they are now."""
-        return self.plant.space(self.arrays.rows("motion"))
+        return self.plant.space(self.arrays.rows("motion"), self.step_count)
 
     def reset(
         self,
@@ -123,7 +130,11 @@ class Formation:
         result, robot, _ = drivers.start(arrays, self._variants, ALONE, poses, settings)
         if result != STARTED:
             raise ValueError(refusal(arrays, self._variants, result, robot))
-        self.plant.reset(arrays.rows("body")[:, :, 0])
+        offsets_s = [
+            lap_s * drivers.uniform(seed, MOVING_OBSTACLE, i, episode)
+            for i, lap_s in enumerate(self.plant.mover_laps_s)
+        ]
+        self.plant.reset(arrays.rows("body")[:, :, 0], offsets_s)
         self._parts.reset(arrays, settings)
         drivers.look(arrays, ALONE, True, settings)
 
@@ -182,8 +193,8 @@ class Formation:
             a robot, on a plant without contact. Then nothing has changed.
         """
         arrays, settings = self.arrays, self._settings
-        motion, period_s = arrays.rows("motion"), settings.period
-        objects = self.plant.objects(motion, period_s)
+        motion, step = arrays.rows("motion"), self.step_count
+        objects = self.plant.objects(motion, step)
         if objects != NO_OBJECTS and not settings.collides:
             raise ValueError(
                 f"plant {self.scenario.plant!r} has no contact: objects in the space need plant 'pymunk'"
@@ -193,7 +204,7 @@ class Formation:
         given = settings._replace(has_parts=True) if by_substep else settings
         result = drivers.control_step(arrays, self._left, self._nothing, given)
         if objects == OUT_OF_REACH and result in (drivers.DONE, drivers.MUST_SUBSTEP):
-            self.plant.advance_objects(motion, settings.substeps, settings.dt)
+            self.plant.advance_objects(motion, step, settings.substeps, settings.dt)
         if result == drivers.DONE:
             return
         if result >= 0:
@@ -218,7 +229,7 @@ class Formation:
         arrays, settings = self.arrays, self._settings
         motion = arrays.rows("motion")
         if close:
-            self.plant.sort(motion)
+            self.plant.sort(motion, self.step_count)
         for substep in range(settings.substeps):
             self._parts.drive(arrays, substep, settings)
             before = motion.copy() if close else motion
@@ -231,10 +242,11 @@ class Formation:
             elif close:
                 self.plant.collide(before, motion, settings.dt)
             drivers.sense(arrays, 0, substep, settings)
-            for robot in self.plant.hit if close else ():
-                if not arrays.touched[0, robot]:
-                    arrays.touched[0, robot] = arrays.touched_now[0, robot] = True
+            for robot, body_type in self.plant.hits.items() if close else ():
+                drivers.mark(arrays, 0, robot, TOUCHED_BY[body_type])
             self._parts.estimate(arrays, substep)
+        if close:
+            arrays.calm[0] = 0  # a contact may have changed velocities at once
 
     def state(self) -> np.ndarray:
         """The true state, (robot, :class:`~tlf_env.task.info.State`), in physical units."""
@@ -272,6 +284,12 @@ def refusal(arrays: Arrays, of: Variants, result: int, robot: int, lane: int = 0
         return (
             f"payload of {mass:g} kg at {behind:g} mm puts the centre of mass {laden.d:g} mm behind "
             f"the axle; the wheels carry it from 0 to {empty.pivot + empty.T:g} mm"
+        )
+    if result == IN_WALL:
+        x, y, theta = rows_of(arrays.states, "start")[:, robot, lane].tolist()
+        return (
+            f"robot_{robot} starts in a wall or an obstacle of the world: its outline around "
+            f"({x:.0f}, {y:.0f}) mm at the heading {theta:.2f} rad"
         )
     return (
         f"robot_{robot}: no start pose without overlap in {START_ATTEMPTS} draws with "

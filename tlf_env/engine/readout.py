@@ -50,7 +50,12 @@ def info_of(arrays: Arrays, key: str) -> np.ndarray:
         return arrays.terms[:, :, place - FIRST_TERM]
     if place < FIRST_FLAG:
         return arrays.applied[place - FIRST_CHANNEL, :, : len(arrays.seeds)].T
-    flags = {"lost": arrays.lost, "touched": arrays.touched, "end": arrays.ends}
+    flags = {
+        "lost": arrays.lost,
+        "touched": arrays.touched,
+        "touched_by": arrays.touched_by,
+        "end": arrays.ends,
+    }
     return flags[key]
 
 
@@ -62,13 +67,11 @@ def info_rows(arrays: Arrays, lane: int = 0) -> list[tuple[float, ...]]:
         arrays.applied[:, :, lane].T.tolist(),
         arrays.lost[lane].tolist(),
         arrays.touched[lane].tolist(),
+        arrays.touched_by[lane].tolist(),
         arrays.ends[lane].tolist(),
         strict=True,
     )
-    return [
-        (*info, *terms, *applied, lost, touched, end)
-        for info, terms, applied, lost, touched, end in rows
-    ]
+    return [(*info, *terms, *applied, *flags) for info, terms, applied, *flags in rows]
 
 
 def reference(arrays: Arrays) -> Any:

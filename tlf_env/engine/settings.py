@@ -20,6 +20,7 @@ class Settings(NamedTuple):
     kinematic: bool
     by_chipmunk: bool  # pymunk's bodies and constraints move the robots, not the kernel
     collides: bool  # robots that are near are stepped through a space with contact
+    round_outlines: bool  # outlines are circles, so that compiled laws can say which touch
     substeps: int
     dt: float  # physics period, s
     period: float  # control period, s
@@ -53,6 +54,7 @@ def make_settings(scenario: Scenario) -> Settings:
         kinematic=scenario.plant == "kinematic",
         by_chipmunk=scenario.plant == "chipmunk",
         collides=scenario.plant in ("pymunk", "chipmunk"),
+        round_outlines=all(one.outline_polygon_mm is None for one in scenario.robot_models),
         substeps=scenario.substeps,
         dt=scenario.physics_period_s,
         period=scenario.control_period_s,

@@ -30,7 +30,7 @@ from tlf_env.engine.arrays import (
 from tlf_env.engine.effects import evaluate_all
 from tlf_env.engine.judging import BODY_D, CLIPPED, record_truth
 from tlf_env.engine.layout import Pose, in_array
-from tlf_env.engine.outlines import BODY_BEHIND, radii
+from tlf_env.engine.outlines import BODY_BEHIND, BODY_OUTLINE, radii
 from tlf_env.engine.radio import broadcast, next_reference
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.compiled import block, law
@@ -38,10 +38,12 @@ from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.numerics.rows import replacing, writer
 from tlf_env.onboard.estimator import Estimate
 from tlf_env.physics.vehicle import Mass, Motion, laden
+from tlf_env.physics.world import gap_to_walls
+from tlf_env.task.info import NOTHING
 from tlf_env.task.measures import distance
 from tlf_env.task.scenario import START_MARGIN_MM
 
-STARTED, OFF_BASE, NO_ROOM = range(3)
+STARTED, OFF_BASE, NO_ROOM, IN_WALL = range(4)
 START_ATTEMPTS = 1000
 
 at_pose = replacing(Motion, "x", "y", "theta", "psi")
@@ -72,11 +74,12 @@ def clear_lane(arrays: Arrays, lane: int) -> None:
         arrays.infos[lane, robot, CLIPPED] = 0.0
         arrays.lost[lane, robot] = arrays.lost_now[lane, robot] = False
         arrays.touched[lane, robot] = arrays.touched_now[lane, robot] = False
+        arrays.touched_by[lane, robot] = NOTHING
     for wheel in range(arrays.torques.shape[0]):
         clear(arrays.torques[wheel], lane, 0, arrays.torques.shape[1])
     for substep in range(arrays.samples.shape[0]):
         clear(arrays.samples[substep], lane, 0, arrays.samples.shape[1])
-    arrays.clock[lane, 0] = arrays.clock[lane, 1] = 0
+    arrays.clock[lane, 0] = arrays.clock[lane, 1] = arrays.calm[lane] = 0
 
 
 @block
@@ -127,6 +130,16 @@ def outlines_apart(arrays: Arrays, lane: int, robot: int, other: int) -> bool:
     return between > radii(arrays, lane, robot, other) + START_MARGIN_MM
 
 
+@law
+def clear_of_walls(arrays: Arrays, lane: int, robot: int) -> bool:
+    """Whether a robot's outline is apart from all walls at its start pose."""
+    behind = arrays.constants[BODY_BEHIND, robot, lane]
+    start = read_start(arrays.states, robot, lane)
+    x = start.x + behind * math.sin(start.theta)
+    y = start.y - behind * math.cos(start.theta)
+    return gap_to_walls(arrays.walls, x, y) > arrays.constants[BODY_OUTLINE, robot, lane]
+
+
 @block
 def line_up(arrays: Arrays, lane: int, settings: Settings) -> None:
     """Start poses of c: the leader on its reference, the others behind it on its tangent."""
@@ -141,7 +154,7 @@ def line_up(arrays: Arrays, lane: int, settings: Settings) -> None:
 
 @block
 def scatter(arrays: Arrays, lane: int) -> int:
-    """Scatter the start poses, each robot redrawn while its outline overlaps another's.
+    """Scatter the start poses, each robot redrawn while its outline overlaps another's or a wall.
 
     Returns the first robot without room, or −1.
     """
@@ -163,7 +176,7 @@ def scatter(arrays: Arrays, lane: int) -> int:
                 turn, _ = draw(arrays, lane, robot, 2 * attempt + 1)
                 pose = Pose(line.x + away * d_x, line.y + away * d_y, line.theta + turned * turn)
                 write_start(arrays.states, robot, lane, pose)
-                apart = True
+                apart = clear_of_walls(arrays, lane, robot)
                 for other in range(robot):
                     apart &= outlines_apart(arrays, lane, robot, other)
         if not apart:
@@ -212,7 +225,7 @@ def start_lane(
     """Start the episode of a lane's seed and number.
 
     ``poses`` ``(lane, robot, 3)``, NaN in lanes whose poses are drawn; without rows if they all are.
-    Returns ``STARTED``, or ``OFF_BASE`` or ``NO_ROOM`` and the robot.
+    Returns ``STARTED``, or ``OFF_BASE``, ``NO_ROOM`` or ``IN_WALL`` and the robot.
     """
     clear_lane(arrays, lane)
     take_variant(arrays, of, lane)
@@ -232,6 +245,8 @@ def start_lane(
         if crowded >= 0:
             return NO_ROOM, crowded
     for robot in range(robots):
+        if not clear_of_walls(arrays, lane, robot):
+            return IN_WALL, robot
         place_robot(arrays, lane, robot)
     begin(arrays, lane, settings)
     return STARTED, 0

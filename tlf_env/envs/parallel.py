@@ -160,6 +160,17 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self._formation.space  # noqa: B018 - puts the bodies at their present poses
         return dict(zip(self.possible_agents, self._formation.plant.bodies, strict=True))
 
+    @property
+    def pushable_bodies(self) -> list[pymunk.Body]:
+        """The pymunk bodies of the world's ``pushables``, in their order, where they are now."""
+        return self._formation.plant.pushable_bodies
+
+    @property
+    def moving_bodies(self) -> list[pymunk.Body]:
+        """The pymunk bodies of the world's ``moving`` obstacles, in their order, where they are now."""
+        self._formation.space  # noqa: B018 - puts the bodies where they are now
+        return self._formation.plant.moving_bodies
+
     def observation_space(self, agent: Agent) -> gymnasium.spaces.Box:
         """Space of an agent's observations; the same object at every call."""
         return self.observation_spaces[agent]
@@ -342,11 +353,17 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                         "radius_mm": patch.radius,
                         "scale": patch.scale,
                     }
-                    for patch in map(PatchRow._make, patch_rows(self.scenario.disturbance).tolist())
+                    for patch in map(PatchRow._make, self._patches())
                     if patch.scale != 1  # otherwise the patch has no effect
                 ],
+                courses_mm=[thing.corners_mm() for thing in self.scenario.world.moving],
             )
         return self._renderer.draw(scene_of(self._formation))
+
+    def _patches(self) -> list[list[float]]:
+        scenario = self.scenario
+        rows: list[list[float]] = patch_rows(scenario.disturbance, scenario.world.patches).tolist()
+        return rows
 
     def _path_mm(self) -> np.ndarray:
         return self._formation.leader_path()

@@ -113,7 +113,12 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         self._info_keys = chosen_keys(infos)
         self._mask_keys = [f"_{key}" for key in self._info_keys]
         self._info_rows = [INFO_KEYS.index(key) for key in self._info_keys]
-        flags = {"lost": np.bool_, "touched": np.bool_, "end": np.int64}
+        flags = {
+            "lost": np.bool_,
+            "touched": np.bool_,
+            "touched_by": np.int64,
+            "end": np.int64,
+        }
         self._flags = {key: dtype for key, dtype in flags.items() if key in self._info_keys}
         robots = self.scenario.robot_count
         agents = [f"robot_{i}" for i in range(robots)]

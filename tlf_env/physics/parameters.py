@@ -5,7 +5,9 @@ Units: mm, kg, s, rad; torques and torque limits N·mm; inertias kg·mm².
 
 from __future__ import annotations
 
-from typing import Annotated, NamedTuple, Self
+import math
+from collections.abc import Mapping
+from typing import Annotated, Any, NamedTuple, Self
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -15,6 +17,24 @@ from tlf_env.numerics.compiled import law
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
 LOAD_SPLIT_TOLERANCE = 1e-9
+CONVEX_TOLERANCE = 1e-9
+
+
+def convex(points: tuple[tuple[float, float], ...]) -> bool:
+    """Whether corners, in order, are those of a convex polygon with an area."""
+    corners = np.array(points, dtype=np.float64)
+    edges = np.roll(corners, -1, axis=0) - corners
+    following = np.roll(edges, -1, axis=0)
+    with np.errstate(over="ignore", invalid="ignore"):
+        turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
+        angles = np.arctan2(turns, (edges * following).sum(axis=1))
+        longest_2 = (edges**2).sum(axis=1).max()
+    if not np.abs(turns).max() > CONVEX_TOLERANCE * longest_2:
+        return False  # all on a line
+    room = CONVEX_TOLERANCE * np.abs(turns).max()
+    one_way = bool((turns >= -room).all() or (turns <= room).all())
+    once_around = abs(abs(float(angles.sum())) - 2 * math.pi) < 1e-6
+    return one_way and once_around
 
 
 class FrictionCurve(Frozen):
@@ -99,8 +119,16 @@ class RobotParameters(Frozen):
     castor_radius_mm: Positive = 20.0
     castor_inertia_kg_mm2: Positive = 4.0
     fork_inertia_kg_mm2: Positive = 20.0
+    # The outline is a circle, or a convex polygon with corners (right, forward of c); then radius and offset
+    # are those of a circle around it.
     outline_radius_mm: Positive = 110.0
     outline_offset_mm: Number = 30.0  # centre of the outline's circle, behind c
+    outline_polygon_mm: (
+        Annotated[tuple[tuple[Number, Number], ...], Field(min_length=3, max_length=100)] | None
+    ) = None
+    # A contact has the product of both surfaces' values, as in Chipmunk.
+    outline_restitution: Annotated[Number, Field(ge=0, le=1)] = 0.0
+    outline_friction: NonNegative = 0.0  # coefficient of Coulomb friction
     # footnote 4
     torque_limit_Nmm: Positive = 15.0
     # Table I; it does not give the tyres' v_d: 1.5 v_s, as for the joints
@@ -116,6 +144,38 @@ class RobotParameters(Frozen):
     def outline_front_mm(self) -> float:
         """How far the outline reaches ahead of c."""
         return self.outline_radius_mm - self.outline_offset_mm
+
+    @model_validator(mode="before")
+    @classmethod
+    def _circle_around_the_polygon(cls, data: Any) -> Any:
+        """Radius and offset of a circle around the polygon, if they are not given."""
+        if not isinstance(data, Mapping) or data.get("outline_polygon_mm") is None:
+            return data
+        try:
+            corners = np.array(data["outline_polygon_mm"], dtype=np.float64).reshape(-1, 2)
+            forward = float(corners[:, 1].min() + corners[:, 1].max()) / 2
+            radius = float(np.hypot(corners[:, 0], corners[:, 1] - forward).max())
+        except (TypeError, ValueError):
+            return data  # the field's own check says what is wrong
+        return {"outline_offset_mm": -forward, "outline_radius_mm": radius} | dict(data)
+
+    @model_validator(mode="after")
+    def _check_outline(self) -> Self:
+        polygon = self.outline_polygon_mm
+        if polygon is None:
+            return self
+        if not convex(polygon):
+            raise ValueError(
+                f"outline_polygon_mm {polygon} must be the corners of a convex polygon, in order"
+            )
+        reach = max(math.hypot(x, y + self.outline_offset_mm) for x, y in polygon)
+        if reach > self.outline_radius_mm * (1 + LOAD_SPLIT_TOLERANCE):
+            raise ValueError(
+                f"outline_radius_mm {self.outline_radius_mm} and outline_offset_mm "
+                f"{self.outline_offset_mm} do not contain outline_polygon_mm; leave them out or give at "
+                f"least {reach:g}"
+            )
+        return self
 
     @model_validator(mode="after")
     def _check_loads(self) -> Self:

@@ -7,12 +7,13 @@ derives them. A scenario that exceeds them still runs.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 from tlf_env.physics.vehicle import RobotParameters, body
+from tlf_env.physics.world import World, capsules_of, gaps_to_capsule
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import OBSERVATION_LIMIT, SAMPLE_ENTRIES, SENSOR_TAIL_ENTRIES
 from tlf_env.task.trajectories import Trajectory, sample
@@ -144,6 +145,57 @@ def warnings_for(
         *_grip(t_s, reference, robot),
         *_meetings(t_s, reference, robot, robots, gap_steps, start_spacing_mm),
     ]
+
+
+def wall_warnings(
+    trajectory: Trajectory, robot: RobotParameters, world: World, horizon_s: float
+) -> list[str]:
+    """A line if the reference passes through walls or obstacles of the world within the horizon.
+
+    The line gives the first place at which the robot's outline (the circle around it) overlaps one, and how
+    many others the path meets. Things that move or can be pushed do not count.
+    """
+    t_s, _ = _times(horizon_s, horizon_s)
+    reference = sample(trajectory, t_s)
+    ahead = np.stack([-np.sin(reference[:, 2]), np.cos(reference[:, 2])], axis=1)
+    centres = reference[:, :2] - robot.outline_offset_mm * ahead
+    met = []
+    for name in ("walls", "obstacles"):
+        for number, thing in enumerate(getattr(world, name)):
+            room = np.min([gaps_to_capsule(one, centres) for one in capsules_of(thing)], axis=0)
+            if (room < robot.outline_radius_mm).any():
+                first = _first(room < robot.outline_radius_mm)
+                deepest = robot.outline_radius_mm - float(room.min())
+                met.append((first, f"world.{name}[{number}]", deepest))
+    if not met:
+        return []
+    first, name, deepest = min(met)
+    more = f"; it meets {len(met) - 1} more" if len(met) > 1 else ""
+    return [
+        f"{_place(t_s, reference, first)}: the path leads the outline of a robot up to {deepest:.0f} mm "
+        f"into {name}{more}"
+    ]
+
+
+def largest_push(robot: RobotParameters) -> float:
+    """The largest steady force (N) with which a robot pushes: by its motors, or the grip of its tyres."""
+    idle = float(_motor_torque(robot, 0.0, 0.0, 0.0, 0.0))
+    motors = 2.0 * (robot.torque_limit_Nmm - idle) / robot.wheel_radius_mm
+    grip = robot.mass_kg * grip_acceleration(robot)[0] / MILLINEWTON_PER_NEWTON
+    return max(min(motors, grip), 0.0)
+
+
+def push_warnings(robots: Sequence[RobotParameters], world: World) -> Iterator[str]:
+    """A line for each body that could be pushed, but that all robots together cannot push."""
+    push = sum(map(largest_push, robots))
+    for number, thing in enumerate(world.pushables):
+        grip = thing.floor_friction * thing.mass_kg * robots[0].gravity_mm_s2
+        if grip > push * MILLINEWTON_PER_NEWTON:
+            yield (
+                f"world.pushables[{number}] holds to the floor with "
+                f"{grip / MILLINEWTON_PER_NEWTON:.3g} N, floor_friction·mass_kg·g; all robots together "
+                f"push with {push:.3g} N, so it yields to impacts only"
+            )
 
 
 def sensor_warnings(

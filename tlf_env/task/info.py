@@ -45,8 +45,18 @@ class EndReason(IntEnum):
     HORIZON = 4
 
 
+class TouchedBy(IntEnum):
+    """What a robot touched first: the values of ``info["touched_by"]`` and ``BatchPlant.touched_by``."""
+
+    NOTHING = 0
+    ROBOT = 1
+    WALL = 2
+    OBSTACLE = 3
+
+
 # The same as plain numbers, for compiled laws.
 RUNNING, LOST, TOUCHED, OTHER_ROBOT, HORIZON = (int(reason) for reason in EndReason)
+NOTHING, ROBOT, WALL, OBSTACLE = (int(thing) for thing in TouchedBy)
 
 INFO_MEANINGS = {
     "position_error_mm": "true position of c to the robot's own reference (leader: the path)",
@@ -72,7 +82,9 @@ INFO_MEANINGS = {
 }
 FLAG_MEANINGS = {
     "lost": "whether the robot was lost at any time so far",
-    "touched": "whether it touched another at any time so far",
+    "touched": "whether it touched another robot, a wall or an obstacle at any time so far",
+    "touched_by": "what it touched first, a `tlf_env.TouchedBy`: 0 nothing, 1 a robot, 2 a wall or "
+    "another thing that stands fast, 3 a moving obstacle",
     "end": "why the episode ended in this step, a `tlf_env.EndReason`: 0 running, 1 lost, 2 touched, "
     "3 another robot ended it, 4 horizon",
 }

@@ -34,7 +34,7 @@ REWARD_MEANINGS = {
     "action_size": "|a|²",
     "slip": "largest slip speed of a drive wheel in the step, in 100 mm/s",
     "lost": "1 in the step in which the robot is lost",
-    "touched": "1 in the step in which the robot first touches another",
+    "touched": "1 in the step in which the robot first touches another robot, a wall or an obstacle",
 }
 
 DEFAULT_WEIGHTS = RewardTerms(

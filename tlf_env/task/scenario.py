@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Self
 
@@ -13,6 +13,7 @@ from pydantic import (
     AfterValidator,
     Field,
     ValidationError,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -40,8 +41,16 @@ from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.vehicle import RobotParameters
+from tlf_env.physics.world import World
 from tlf_env.task.actions import ActionKind
-from tlf_env.task.feasibility import disturbed, sensor_warnings, start_note, warnings_for
+from tlf_env.task.feasibility import (
+    disturbed,
+    push_warnings,
+    sensor_warnings,
+    start_note,
+    wall_warnings,
+    warnings_for,
+)
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
 from tlf_env.task.trajectories import Trajectory
 from tlf_env.task.waypoints import MAX_MAGNITUDE, scenario_of_waypoints
@@ -124,6 +133,7 @@ class Scenario(Frozen):
     # What moves the robots: `pymunk` is the exact kernel, with contact in a pymunk space; `batch` the kernel
     # alone; `kinematic` the wheels' commands; `chipmunk` pymunk's own bodies and constraints.
     plant: Literal["pymunk", "batch", "kinematic", "chipmunk"] = "pymunk"
+    world: World = World()
 
     wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
     estimator: EstimatorKind | PartPath = "ekf"
@@ -157,12 +167,13 @@ class Scenario(Frozen):
             return data
         base = data.get("robot", {})
         if isinstance(base, Mapping):
-            base = _merged(RobotParameters().model_dump(), base)
+            base = _robot_with(RobotParameters().model_dump(), base)
         data = {**data, "robot": base}
         if isinstance(data.get("robots"), list | tuple):
             common = base.model_dump() if isinstance(base, RobotParameters) else base
             data["robots"] = [
-                _merged(common, one) if isinstance(one, Mapping) else one for one in data["robots"]
+                _robot_with(common, one) if isinstance(one, Mapping) else one
+                for one in data["robots"]
             ]
         return data
 
@@ -180,6 +191,17 @@ class Scenario(Frozen):
     @classmethod
     def _named_disturbance(cls, value: Any) -> Any:
         return _disturbance_preset(value) if isinstance(value, str) else value
+
+    @field_validator("world", mode="before")
+    @classmethod
+    def _named_world(cls, value: Any, info: ValidationInfo) -> Any:
+        """A preset or a file; a relative path starts at the scenario's folder or the working directory."""
+        if not isinstance(value, str | Path):
+            return value
+        beside = Path((info.context or {}).get("folder", "")) / value
+        if is_file_name(value) and beside.is_file():
+            value = beside
+        return read_preset_or_file("world", value, ", nor a mapping")
 
     @field_validator("reward", mode="before")
     @classmethod
@@ -252,7 +274,18 @@ class Scenario(Frozen):
             )
         if self.plant == "batch":
             self.check_lanes()
+        if self.plant in ("batch", "kinematic"):
+            self._check_contact()
         return self
+
+    def _check_contact(self) -> None:
+        """Check that the world needs no pymunk space."""
+        needs = f"needs plant 'pymunk'; plant {self.plant!r} has none"
+        for name in ("pushables", "moving"):
+            if getattr(self.world, name):
+                raise ValueError(f"world.{name} {needs} of them, only walls, obstacles and patches")
+        if any(one.outline_polygon_mm is not None for one in self.robot_models):
+            raise ValueError(f"outline_polygon_mm {needs}, only round outlines")
 
     def check_lanes(self) -> None:
         """Check that the scenario can run in a batch of formations, without Python in the step.
@@ -426,6 +459,26 @@ def _warnings_for(*what: Any) -> tuple[str, ...]:
     )
 
 
+@functools.lru_cache(maxsize=64)
+def _wall_warnings(*what: Any) -> tuple[str, ...]:
+    return tuple(wall_warnings(*what))
+
+
+def _contact_warnings(scenario: Scenario) -> Iterator[str]:
+    """Lines for surfaces without effect on the robots: a contact has the product of both values."""
+    for field in ("restitution", "friction"):
+        if any(getattr(robot, f"outline_{field}") for robot in scenario.robot_models):
+            continue
+        for name in ("walls", "obstacles", "pushables", "moving"):
+            for number, thing in enumerate(getattr(scenario.world, name)):
+                value = getattr(thing, field)
+                if field in thing.model_fields_set and value not in (0.0, 1.0):
+                    yield (
+                        f"world.{name}[{number}].{field} {value:g} has no effect on robots: a contact "
+                        f"has the product of both values, and robot.outline_{field} is 0"
+                    )
+
+
 def scenario_warnings(scenario: Scenario) -> list[str]:
     """A line for each limit of the robots or of the observation that the scenario exceeds.
 
@@ -444,6 +497,16 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             scenario.start_spacing_mm,
         )
     ]
+    if scenario.world.statics:
+        lines += [
+            line
+            for robot in dict.fromkeys(scenario.robot_models)
+            for line in _wall_warnings(
+                scenario.trajectory, robot, scenario.world, scenario.horizon_s
+            )
+        ]
+    lines += push_warnings(scenario.robot_models, scenario.world)
+    lines += _contact_warnings(scenario)
     if scenario.observation == "sensor":
         lines += sensor_warnings(
             scenario.trajectory,
@@ -481,6 +544,14 @@ def _disturbed_robots(scenario: Scenario) -> list[RobotParameters]:
     return [
         disturbed(robot, 1.0 if grip is None else grip, gain) for robot in scenario.robot_models
     ]
+
+
+def _robot_with(base: Any, differences: Mapping[str, Any]) -> Any:
+    """A robot's parameters with some of them changed; a polygon as outline has a circle of its own."""
+    if isinstance(base, Mapping) and differences.get("outline_polygon_mm") is not None:
+        around = ("outline_radius_mm", "outline_offset_mm")
+        base = {name: value for name, value in base.items() if name not in around}
+    return _merged(base, differences)
 
 
 def _merged(old: Any, new: Any) -> Any:
