@@ -1,6 +1,6 @@
 """A person crosses the way: a policy that looks, and one that does not.
 
-The person is a ``moving`` obstacle of the scenario's world: it walks to and fro, whatever it meets.
+The person is a ``moving`` obstacle of the scenario's world: it walks back and forth, whatever it meets.
 ``Careful`` wraps any policy. It stops a robot while driving on would bring it too close to the person within
 the next seconds, and otherwise leaves the action as it is.
 

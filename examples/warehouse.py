@@ -64,7 +64,7 @@ def drive(env: FormationParallelEnv) -> tuple[np.ndarray, np.ndarray, list[str]]
 
 def clearance(world: World, kind: type, centres: np.ndarray, radius_mm: float) -> float:
     """Smallest distance of an outline from the walls or the obstacles of a world, mm."""
-    things = [thing for thing in world.statics if isinstance(thing, Wall) == (kind is Wall)]
+    things = [thing for thing in world.fixed if isinstance(thing, Wall) == (kind is Wall)]
     gaps = [gaps_to_capsule(one, centres) for thing in things for one in capsules_of(thing)]
     return float(np.min(gaps)) - radius_mm
 

@@ -10,7 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from tlf_env.physics.shapes import PlacedShape, border, placed_shape, signed_area
+from tlf_env.physics.shapes import PlacedShape, border, placed_link, placed_shape, signed_area
 from tlf_env.physics.world import Capsule, gaps_to_capsule
 
 HULLS = {
@@ -69,3 +69,12 @@ def test_a_shape_is_placed_as_pymunk_places_it(x: float, y: float, angle: float)
         assert found.radius_mm == shape.radius
         there = [body.local_to_world(corner) for corner in corners]
         assert np.allclose(found.corners_mm, there, atol=1e-8)
+
+
+@pytest.mark.parametrize("pose", [(math.nan, 0.0, 0.0), (0.0, math.inf, 0.0), (0.0, 0.0, math.inf)])
+def test_a_shape_that_is_nowhere_has_no_place(pose: tuple[float, float, float]) -> None:
+    body, other = pymunk.Body(1.0, 1.0), pymunk.Body(1.0, 1.0)
+    rope = pymunk.SlideJoint(body, other, (0.0, 0.0), (1.0, 0.0), 0.0, 9.0)
+    assert placed_shape(pymunk.Circle(body, 5.0), pose) is None
+    assert placed_link(rope, (0.0, 0.0, 0.0), pose) is None
+    assert placed_link(rope, (0.0, 0.0, 0.0), (2.0, 0.0, 0.0)) is not None

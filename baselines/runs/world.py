@@ -31,7 +31,7 @@ def colour(rgb: looks.Colour, strength: float = 1.0) -> tuple[float, ...]:
 
 def fixed_borders(record: Record) -> list[np.ndarray]:
     """Borders of walls, piece by piece, and of obstacles, each ``(point, 2)``, mm."""
-    return [piece for thing in record.scenario.world.statics for piece in _pieces(thing)]
+    return [piece for thing in record.scenario.world.fixed for piece in _pieces(thing)]
 
 
 def _pieces(thing: Wall | Obstacle) -> list[np.ndarray]:
@@ -154,7 +154,7 @@ def world_handles(record: Record) -> list[Artist]:
     """Entries of a legend for what the world contains."""
     world = record.scenario.world
     handles: list[Artist] = []
-    if world.statics:
+    if world.fixed:
         handles.append(
             Patch(fc=colour(looks.WALL), ec=colour(looks.WALL_EDGE), label="wall or obstacle")
         )

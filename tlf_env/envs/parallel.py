@@ -325,6 +325,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     def render(self) -> np.ndarray | None:
         """A frame ``(height, width, 3)`` uint8 in mode ``rgb_array``; None in mode ``human``.
 
+        It shows robots, world and whatever else is in :attr:`space`; drawing changes none of it.
         In mode ``human`` it does nothing: :meth:`reset` and :meth:`step` have drawn the frame.
 
         Raises

@@ -56,10 +56,10 @@ class Mover:
         self.body.velocity = (next_x - x) / period_s, (next_y - y) / period_s
 
 
-def build_statics(space: pymunk.Space, world: World) -> list[pymunk.Shape]:
+def build_fixed(space: pymunk.Space, world: World) -> list[pymunk.Shape]:
     """Add walls and obstacles to a space; returns their shapes."""
     shapes: list[pymunk.Shape] = []
-    for thing in world.statics:
+    for thing in world.fixed:
         own: list[pymunk.Shape]
         if isinstance(thing, Wall):
             own = [

@@ -20,9 +20,9 @@ from pymunk.batch import BodyFields, Buffer, get_space_bodies
 from tlf_env.physics.objects import (
     Mover,
     Pushed,
+    build_fixed,
     build_movers,
     build_pushables,
-    build_statics,
     damped_velocity,
 )
 from tlf_env.physics.parameters import Body, RobotParameters, body_array
@@ -123,7 +123,7 @@ class PymunkPlant:
         self._outlines = [next(iter(body.shapes)) for body in self.bodies]
         self._number = {body: i for i, body in enumerate(self.bodies)}
         world = World() if world is None else world
-        self._walls = set(build_statics(space, world))
+        self._walls = set(build_fixed(space, world))
         self._pushed: list[Pushed] = build_pushables(
             space, world, robots[0].gravity_mm_s2, floor=space.static_body
         )
@@ -132,6 +132,8 @@ class PymunkPlant:
         self._rests: dict[pymunk.Body, Rest] = {one.body: _rest(one.body) for one in self._pushed}
         self._shared = False  # whether a user has had the space
         self._buffer = Buffer()
+        # Half the thickness and the farthest point of bodies, mm; found once per control step.
+        self._sizes: dict[pymunk.Body, tuple[float, float]] = {}
         self._calm: tuple[Any, ...] = ()
         self.reset()
 
@@ -150,6 +152,7 @@ class PymunkPlant:
         space.remove(*shapes)  # with a shape its contacts go
         for body in space.bodies:
             _take_correction(body)
+            body.force, body.torque = (0.0, 0.0), 0.0
         for body, rest in self._rests.items():
             body.angle, body.position = rest.angle, rest.position
             body.velocity, body.angular_velocity = rest.velocity, rest.angular_velocity
@@ -318,18 +321,24 @@ class PymunkPlant:
         """
         space, period_s = self._space, self._period_s
         calm_s = MOST_CALM_S
-        for body, outline in zip(self.bodies, self._outlines, strict=True):
-            speed = _fastest_point(body) + fastest
+        speeds = [_fastest_point(body) for body in self.bodies]
+        for body, outline, own_speed in zip(self.bodies, self._outlines, speeds, strict=True):
+            # The compiled laws know of outlines and walls, but not of shapes that a user adds to a robot.
+            enlarged = len(body.shapes) > 1
+            speed = own_speed + (max([fastest, *speeds]) if enlarged else fastest)
             box = outline.cache_bb()
             centre = ((box.left + box.right) / 2, (box.bottom + box.top) / 2)
             size = math.hypot(box.right - box.left, box.top - box.bottom) / 2
             if isinstance(outline, pymunk.Circle):
                 size = outline.radius
+            if enlarged:
+                centre, size = (body.position.x, body.position.y), farthest_point(body)
             room = CLOSE_MARGIN_MM + (speed + 2.0 * FASTEST_CHANGE_MM_S2 * period_s) * period_s
             wide = size + CLOSE_MARGIN_MM + way(speed, MOST_CALM_S)
             near = pymunk.BB(centre[0] - wide, centre[1] - wide, centre[0] + wide, centre[1] + wide)
             for shape in space.bb_query(near, pymunk.ShapeFilter()):
-                if shape.body in self._number or shape in self._walls:
+                known = shape.body in self._number or shape in self._walls
+                if shape.body is body or (known and not enlarged):
                     continue
                 apart = shape.point_query(centre).distance - size
                 if apart <= room:
@@ -363,8 +372,13 @@ class PymunkPlant:
         """In how many parts a step of the space has to be made."""
         farthest = 0.0
         for body in self._space.bodies:
-            if body.shapes and not _is_still(body):
-                farthest = max(farthest, _fastest_point(body) * dt / half_thickness(body))
+            if _is_still(body) or not body.shapes:
+                continue
+            if body not in self._sizes:
+                self._sizes[body] = half_thickness(body), farthest_point(body)
+            half, radius = self._sizes[body]
+            speed = body.velocity.length + abs(body.angular_velocity) * radius
+            farthest = max(farthest, speed * dt / half)
         return min(max(1, math.ceil(farthest / LARGEST_MOVE)), MOST_SPLITS)
 
     def _step_once(self, dt: float) -> None:
@@ -384,7 +398,7 @@ class PymunkPlant:
             body.velocity = velocities[V_X, i, 0], velocities[V_Y, i, 0]
             body.angular_velocity = velocities[YAW, i, 0]
 
-    def sort(self, motions: np.ndarray, step: int) -> None:
+    def sort(self, motions: np.ndarray, step: int = 0) -> None:
         """Make the space's index of outlines anew, robot by robot; to be called before a control step.
 
         The order in which Chipmunk solves contacts comes from that index, which otherwise depends on all
@@ -414,6 +428,7 @@ class PymunkPlant:
             if body.force != (0.0, 0.0) or body.torque
         ]
         self._pulled = {i for i, body in enumerate(self.bodies) if _is_forced(body)}
+        self._sizes.clear()
 
     def _forget_constraints(self) -> None:
         """Set the impulses that constraints remember to 0; to be called before a control step.
@@ -499,7 +514,7 @@ class PymunkPlant:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
         if not self._corrections:
             self._corrections = [(body, _take_correction(body)) for body in self._space.bodies]
-        return {**self.__dict__, "_buffer": None, "_calm": ()}
+        return {**self.__dict__, "_buffer": None, "_calm": (), "_sizes": {}}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _buffer=Buffer())
@@ -518,6 +533,21 @@ def _half_width(shape: pymunk.Shape) -> float:
         heights = np.ptp(corners @ normals, axis=0)
         return float(heights.min()) / 2 + shape.radius
     return float(shape.radius) if isinstance(shape, pymunk.Circle | pymunk.Segment) else 0.0
+
+
+def farthest_point(body: pymunk.Body) -> float:
+    """A bound on the distance of all points of a body's shapes from its centre of mass, mm."""
+    return max(map(_farthest_of, body.shapes)) + body.center_of_gravity.length
+
+
+def _farthest_of(shape: pymunk.Shape) -> float:
+    if isinstance(shape, pymunk.Circle):
+        return float(shape.offset.length + shape.radius)
+    if isinstance(shape, pymunk.Segment):
+        return float(max(shape.a.length, shape.b.length) + shape.radius)
+    if isinstance(shape, pymunk.Poly):
+        return float(max(corner.length for corner in shape.get_vertices()) + shape.radius)
+    return 0.0
 
 
 def _rest(body: pymunk.Body) -> Rest:

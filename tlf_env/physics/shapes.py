@@ -73,7 +73,7 @@ def signed_area(corners: np.ndarray) -> float:
 
 
 def placed_shape(shape: pymunk.Shape, pose: Pose) -> PlacedShape | None:
-    """A shape with its body at a pose; None if it is neither circle, segment nor polygon."""
+    """A shape with its body at a pose; None if it is neither circle, segment nor polygon, or nowhere."""
     points: Sequence[Sequence[float]]
     if isinstance(shape, pymunk.Circle):
         points, radius = [shape.offset], shape.radius
@@ -85,17 +85,24 @@ def placed_shape(shape: pymunk.Shape, pose: Pose) -> PlacedShape | None:
         return None
     body = shape.body
     kind: Kind = "zone" if shape.sensor else KINDS[body.body_type if body else pymunk.Body.STATIC]
-    return PlacedShape(kind, _placed(points, pose), float(radius))
+    return _somewhere(kind, _placed(points, pose), radius)
 
 
 def placed_link(joint: pymunk.Constraint, pose_a: Pose, pose_b: Pose) -> PlacedShape | None:
     """The line between the anchors of a joint or spring with its bodies at two poses; None if it has none."""
     if not isinstance(joint, LINKS):
         return None
-    ends = _placed([joint.anchor_a], pose_a) + _placed([joint.anchor_b], pose_b)
-    return PlacedShape("link", ends, 0.0)
+    ends = [_placed([joint.anchor_a], pose_a), _placed([joint.anchor_b], pose_b)]
+    return _somewhere("link", np.concatenate(ends), 0.0)
 
 
-def _placed(points: Sequence[Sequence[float]], pose: Pose) -> tuple[tuple[float, float], ...]:
-    there = placed(np.array(points, dtype=np.float64), *pose)
-    return tuple((float(x), float(y)) for x, y in there)
+def _placed(points: Sequence[Sequence[float]], pose: Pose) -> np.ndarray:
+    local = np.array(points, dtype=np.float64)
+    return placed(local, *pose) if all(map(math.isfinite, pose)) else np.full_like(local, np.nan)
+
+
+def _somewhere(kind: Kind, corners_mm: np.ndarray, radius_mm: float) -> PlacedShape | None:
+    """None for a body whose place is not a number."""
+    if not (np.isfinite(corners_mm).all() and math.isfinite(radius_mm)):
+        return None
+    return PlacedShape(kind, tuple((x, y) for x, y in corners_mm.tolist()), float(radius_mm))

@@ -210,7 +210,7 @@ class World(Frozen):
     patches: Annotated[tuple[Patch, ...], Field(max_length=MAX_PIECES)] = ()
 
     @property
-    def statics(self) -> tuple[Wall | Obstacle, ...]:
+    def fixed(self) -> tuple[Wall | Obstacle, ...]:
         """Everything that stands fast."""
         return (*self.walls, *self.obstacles)
 
@@ -267,7 +267,7 @@ def capsules_of(thing: Wall | Obstacle) -> list[Capsule]:
 
 def capsule_rows(world: World) -> np.ndarray:
     """The static world, ``(capsule, Capsule)``."""
-    found = [one for thing in world.statics for one in capsules_of(thing)]
+    found = [one for thing in world.fixed for one in capsules_of(thing)]
     return np.array(found, dtype=np.float64).reshape(-1, len(Capsule._fields))
 
 

@@ -497,7 +497,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             scenario.start_spacing_mm,
         )
     ]
-    if scenario.world.statics:
+    if scenario.world.fixed:
         lines += [
             line
             for robot in dict.fromkeys(scenario.robot_models)
