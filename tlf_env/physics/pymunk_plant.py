@@ -364,6 +364,12 @@ class PymunkPlant:
 
     def _step_space(self, dt: float) -> None:
         """A step of the space, in parts if a body would move far compared with its thickness."""
+        parts = self._splits(dt)
+        for _ in range(parts):
+            self._step_once(dt / parts)
+
+    def _splits(self, dt: float) -> int:
+        """In how many parts a step of the space has to be made."""
         farthest = 0.0
         for body in self._space.bodies:
             if _is_still(body) or not body.shapes:
@@ -373,16 +379,17 @@ class PymunkPlant:
             half, radius = self._sizes[body]
             speed = body.velocity.length + abs(body.angular_velocity) * radius
             farthest = max(farthest, speed * dt / half)
-        parts = min(max(1, math.ceil(farthest / LARGEST_MOVE)), MOST_SPLITS)
-        for _ in range(parts):
-            for body, force, torque in self._forces:
-                body.force, body.torque = force, torque
-            if self._corrections:
-                self._step_after_a_copy(dt / parts)
-            else:
-                self._space.step(dt / parts)
-            for i, body in enumerate(self.bodies):
-                body.each_arbiter(self._remember, i)
+        return min(max(1, math.ceil(farthest / LARGEST_MOVE)), MOST_SPLITS)
+
+    def _step_once(self, dt: float) -> None:
+        for body, force, torque in self._forces:
+            body.force, body.torque = force, torque
+        if self._corrections:
+            self._step_after_a_copy(dt)
+        else:
+            self._space.step(dt)
+        for i, body in enumerate(self.bodies):
+            body.each_arbiter(self._remember, i)
 
     def _write(self, poses: np.ndarray, velocities: np.ndarray) -> None:
         for i, body in enumerate(self.bodies):
@@ -459,7 +466,8 @@ class PymunkPlant:
         """
         self._write(before, motions)
         self._moved_before, self._moved = self._moved, set()
-        self._run(dt)
+        self.hits = {}
+        self._step_space(dt)
         self._moved |= self._pulled
         for i in self._moved | self._moved_before:
             body = self.bodies[i]
@@ -470,11 +478,6 @@ class PymunkPlant:
 
     def release(self) -> None:
         """Called after a control step that ran substep by substep."""
-
-    def _run(self, dt: float) -> None:
-        """A substep of the space, and which robots a contact has moved in it."""
-        self.hits = {}
-        self._step_space(dt)
 
     def _remember(self, arbiter: pymunk.Arbiter, robot: int) -> None:
         self._moved.add(robot)
