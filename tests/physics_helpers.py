@@ -28,6 +28,15 @@ from tlf_env.physics.state import (
 DT_S = 0.001
 ROBOT = RobotParameters()
 WITHOUT_JOINT_FRICTION = RobotParameters(joint_friction=False)
+
+
+def complete(floor: ArrayLike) -> np.ndarray:
+    """A floor, or one a substep, with zeros for the fields that are not given."""
+    given = np.asarray(floor, dtype=np.float64)
+    missing = np.zeros((*given.shape[:-1], len(Floor._fields) - given.shape[-1]))
+    return np.concatenate([given, missing], axis=-1)
+
+
 FLOOR = Floor(0.0, 0.0, 1.0, 1.0, 1.0)
 ICE = Floor(0.0, 0.0, 0.0, 0.0, 0.0)
 STILL = Motion(*[0.0] * len(Motion._fields))
@@ -107,7 +116,15 @@ def run(
     motions[:, 0, 0], contacts[:, 0, 0] = start, memory
     constants = body(robot) if isinstance(robot, RobotParameters) else robot
     bodies = np.array(constants, dtype=np.float64).reshape(-1, 1, 1)
-    record(bodies, motions, contacts, 1000.0 * rows(torques_Nmm), rows(push), rows(floor), dt_s)
+    record(
+        bodies,
+        motions,
+        contacts,
+        1000.0 * rows(torques_Nmm),
+        rows(push),
+        rows(complete(floor)),
+        dt_s,
+    )
     return Run(Motion(*motions[:, :, 0]), Contact(*contacts[:, :, 0]))
 
 

@@ -20,6 +20,7 @@ from physics_helpers import (
     ROBOT,
     STILL,
     WITHOUT_JOINT_FRICTION,
+    complete,
     forward_speed,
     kinetic_energy,
     random_start,
@@ -32,7 +33,7 @@ from baselines import ReferencePolicy
 from tlf_env.physics.chipmunk_plant import ChipmunkPlant
 from tlf_env.physics.openloop import COLUMNS, load_scenarios, run_open_loop
 from tlf_env.physics.parameters import RobotParameters, body
-from tlf_env.physics.state import Contact, Motion
+from tlf_env.physics.state import Contact, Floor, Motion
 
 GOLDEN = Path(__file__).parent / "golden"
 SCENARIOS = load_scenarios(GOLDEN / "scenarios.json")
@@ -71,7 +72,7 @@ def run(
     motions = np.array(starts).T[:, :, None].copy()
     contacts = np.repeat(np.array(NO_MEMORY)[:, None, None], len(starts), axis=1)
     torques = np.broadcast_to(1000.0 * np.asarray(torques_Nmm), (steps, 2))
-    floors = np.broadcast_to(np.asarray(floor), (steps, 5))
+    floors = np.broadcast_to(complete(floor), (steps, len(Floor._fields)))
     if objects:
         plant.space(motions, 0).add(*objects)
     rows = [(motions[:, :, 0].copy(), contacts[:, :, 0].copy())]
