@@ -43,11 +43,14 @@ class Mover:
     speed_mm_s: float
     offset_s: float = 0.0  # drawn for the episode
 
+    def at(self, time_s: float) -> tuple[float, float]:
+        """Where the body is at a time, mm."""
+        return self.course.at(self.start_s + self.offset_s + time_s)
+
     def place(self, time_s: float, period_s: float) -> None:
         """Put the body where it is at a time, with the velocity that leads to its next place."""
-        now = self.start_s + self.offset_s + time_s
-        x, y = self.course.at(now)
-        next_x, next_y = self.course.at(now + period_s)
+        x, y = self.at(time_s)
+        next_x, next_y = self.course.at(self.start_s + self.offset_s + time_s + period_s)
         self.body.position = x, y
         self.body.velocity = (next_x - x) / period_s, (next_y - y) / period_s
 

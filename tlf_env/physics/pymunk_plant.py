@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pymunk
 
+from tlf_env.physics.borders import Borders
 from tlf_env.physics.objects import (
     Mover,
     Pushed,
@@ -26,7 +27,7 @@ from tlf_env.physics.objects import (
 )
 from tlf_env.physics.parameters import Body, RobotParameters, body_array
 from tlf_env.physics.state import Motion
-from tlf_env.physics.world import World
+from tlf_env.physics.world import Capsule, World
 
 ITERATIONS = 20
 COLLISION_SLOP_MM = 0.1
@@ -35,6 +36,9 @@ SEPARATED = 3  # Chipmunk's state of a contact that has ended, and is remembered
 X, Y, THETA, V_X, V_Y, YAW = (
     Motion._fields.index(name) for name in ("x", "y", "theta", "v_x", "v_y", "w")
 )
+
+POSE = [X, Y, THETA]
+NOTHING, NOBODY = np.zeros((0, len(Capsule._fields))), np.zeros(0, dtype=np.int64)
 
 # What the objects in the space do within a control step, walls of the world apart.
 NO_OBJECTS, OUT_OF_REACH, WITHIN_REACH = range(3)
@@ -124,6 +128,8 @@ class PymunkPlant:
         self._floor = [joint for one in self._pushed for joint in one.joints]
         self._rests: dict[pymunk.Body, Rest] = {one.body: _rest(one.body) for one in self._pushed}
         self._shared = False  # whether a user has had the space
+        self._borders: Borders | None = None  # of what rays see in the space, and for which shapes
+        self._bordered: tuple[list[pymunk.Shape], list[bool]] = [], []
         self._own = self._seen = self._counts()
         self.reset()
 
@@ -192,6 +198,36 @@ class PymunkPlant:
         for mover in self._movers:
             mover.place(step * self._period_s, self._period_s)
             self._space.reindex_shapes_for_body(mover.body)
+
+    def visible(self, motions: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """What the space contains besides the walls of the world and round robots.
+
+        Capsules ``(number, Capsule)``, and the robots ``(number,)`` on whose bodies they are, or −1. Nothing in
+        the space changes, so that looking changes no motion.
+        """
+        round_only = all(polygon is None for polygon in self._polygons)
+        if round_only and not (self._shared or self._pushed or self._movers):
+            return NOTHING, NOBODY
+        shapes = list(self._space.shapes)
+        kinds = [shape.sensor for shape in shapes]
+        if self._borders is None or (shapes, kinds) != self._bordered:
+            skipped = {*self._walls, *(self._outlines if round_only else ())}
+            self._borders = Borders(
+                [one for one in shapes if one not in skipped and not one.sensor]
+            )
+            self._bordered = shapes, kinds
+        borders = self._borders
+        if not borders.bodies:
+            return NOTHING, NOBODY
+        moved = {mover.body: mover.at(step * self._period_s) for mover in self._movers}
+        owners = [self._number.get(body, -1) for body in borders.bodies]
+        poses = [
+            tuple(motions[POSE, owner, 0].tolist())
+            if owner >= 0
+            else (*moved.get(body, body.position), body.angle)
+            for body, owner in zip(borders.bodies, owners, strict=True)
+        ]
+        return borders.capsules(poses), np.array(owners, dtype=np.int64)[borders.body_of]
 
     def _counts(self) -> tuple[int, int, int]:
         space = self._space
@@ -423,7 +459,7 @@ class PymunkPlant:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
         if not self._corrections:
             self._corrections = [_take_correction(body) for body in self._space.bodies]
-        return self.__dict__.copy()
+        return {**self.__dict__, "_borders": None, "_bordered": ([], [])}
 
 
 def way(speed: float, time_s: float) -> float:
