@@ -23,7 +23,7 @@ from baselines.policies.registry import fit_policy, make_policy
 from tlf_env.physics.ranging import way_to
 from tlf_env.physics.world import Capsule
 from tlf_env.task.observation import sensor_entries, tracking_entries
-from tlf_env.task.scenario import load_scenario
+from tlf_env.task.scenario import load_scenario, scenario_warnings
 
 COUNT, RANGE_MM = 16, 1000.0
 RADIUS_MM, BEHIND_MM = 110.0, 30.0  # of the outline
@@ -459,6 +459,13 @@ def test_a_batch_has_the_bits_of_single_environments():
                 given_to = zip(env.agents, actions[step, k], strict=True)
                 observations, *_ = env.step(dict(given_to))
     assert (rows[-1][..., -12:] < 1.0).any()
+
+
+def test_a_range_within_the_outline_gives_a_warning():
+    said = "rays.range_mm 110 is at most outline_radius_mm 110"
+    lines = scenario_warnings(load_scenario("infinity", rays={"range_mm": 110.0}))
+    assert any(line.startswith(said) for line in lines)
+    assert not scenario_warnings(load_scenario("infinity", rays={"range_mm": 111.0}))
 
 
 def test_gymnasium_has_the_rays():

@@ -204,7 +204,8 @@ readings_mm = observations["robot_1"][-16:] * env.scenario.rays.range_mm
 - A reading is the distance from that centre to the first border of a robot, a wall, an obstacle, a pushed body
   or an object of yours in the space. Shapes on the robot's own body and sensor shapes of pymunk are not seen.
   If nothing is within `range_mm`, the reading is `range_mm`; inside a wall or a disc it is 0.
-- `noise_std_mm` adds white noise, which has its own random stream; readings stay within 0 and `range_mm`.
+- `noise_std_mm` adds white noise to every reading, which has its own random stream; readings stay within 0 and
+  `range_mm`.
 - `period_s` is the time between two readings, by default one control period. In between, the last one holds.
 - Walls, static obstacles and round robots are seen on every plant, with the same bits. Everything else needs
   the plant `pymunk`.

@@ -513,6 +513,12 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             time_gap_s=scenario.time_gap_s,
             start_spacing_mm=scenario.start_spacing_mm,
         )
+    radius_mm = min(robot.outline_radius_mm for robot in scenario.robot_models)
+    if scenario.rays is not None and scenario.rays.range_mm <= radius_mm:
+        lines.append(
+            f"rays.range_mm {scenario.rays.range_mm:g} is at most outline_radius_mm {radius_mm:g}: rays "
+            "start at the centre of the outline, so that they meet nothing outside"
+        )
     if scenario.estimator == "ekf" and controller(scenario.residual_base).limits.cancel_slip:
         lines.append(
             f"residual_base {scenario.residual_base!r} subtracts the estimated slip from its commands, "
