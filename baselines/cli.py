@@ -80,7 +80,7 @@ def run(
     seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     robots: Annotated[int | None, typer.Option(help="Number of robots.")] = None,
     plant: Annotated[
-        str | None, typer.Option(help="pymunk, batch (no contact) or kinematic.")
+        str | None, typer.Option(help="pymunk, batch (no contact), kinematic or chipmunk.")
     ] = None,
     control_period_s: Annotated[
         float | None, typer.Option(help="Control period of the policy, s.")
@@ -207,6 +207,9 @@ def openloop(
         "results/openloop"
     ),
     dt_s: Annotated[float, typer.Option(help="Substep, s; it must divide 0.1.")] = 0.001,
+    plant: Annotated[
+        str, typer.Option(help="kernel, or chipmunk: pymunk's bodies and constraints.")
+    ] = "kernel",
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the paths of the files as JSON.")
     ] = False,
@@ -220,7 +223,7 @@ def openloop(
     with progress_bar("open loop") as update:
         for done, (name, scenario) in enumerate(loaded.items(), start=1):
             written[name] = str(
-                write_rows(folder / f"{name}.csv", run_open_loop(scenario, dt_s=dt_s))
+                write_rows(folder / f"{name}.csv", run_open_loop(scenario, dt_s=dt_s, plant=plant))
             )
             update(done, len(loaded))
     if as_json:
@@ -316,7 +319,7 @@ def bench(
     horizon_s: Annotated[float | None, typer.Option(help="Length of each run, s.")] = None,
     plant: Annotated[
         str | None,
-        typer.Option(help="pymunk, batch (seeds side by side, no contact) or kinematic."),
+        typer.Option(help="pymunk, batch (seeds side by side, no contact), kinematic or chipmunk."),
     ] = None,
     processes: Annotated[int, typer.Option(help="Processes on this machine; 0: one per core.")] = 0,
     ray: Annotated[

@@ -36,14 +36,15 @@ def metrics_table(record: Record) -> Table:
     table.add_column("robot")
     for heading, _, _ in columns:
         table.add_column(heading, justify="right")
-    table.add_column("end")
+    table.add_column("lost,\ntouched")
     for i, metrics in enumerate(record.metrics()):
         row = metrics._asdict() | {"saturation_fraction": 100 * metrics.saturation_fraction}
         cells = [
             "–" if row[key] is None else f"{row[key]:.{digits}f}" for _, key, digits in columns
         ]
-        ends = [name for name in ("lost", "touched") if row[name]]
-        table.add_row(str(i), *cells, " ".join(ends) or "ok")
+        ends = ["lost"] if metrics.lost else []
+        ends += [str(metrics.touched_by)] if metrics.touched else []
+        table.add_row(str(i), *cells, ", ".join(ends) or "ok")
     return table
 
 

@@ -45,6 +45,7 @@ CASES = {
     "phase": Case({"disturbance": "noise"}, {"phase_s": 7.3}),
     "poses": Case({"disturbance": "start"}, {"poses": POSES}),
     "touching": Case({"lost_beyond_mm": 1e5}, {"poses": [[0, 0, 0], [0, -219.5, 0], [0, -600, 0]]}),
+    "walls": Case({"world": {"walls": [{"points_mm": [[0, 2750], [5000, 2750]]}]}}),
     "both options": Case({}, {"phase_s": -2.0, "poses": POSES}),
 }
 

@@ -34,7 +34,7 @@ def example(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_there_is_something_to_run() -> None:
-    assert len(SCRIPTS) == 8
+    assert len(SCRIPTS) == 13
     assert FILES == ["mixed_formation", "own_robot"]
 
 
@@ -64,6 +64,25 @@ def test_a_short_run_prints_its_result(
     example.main(horizon_s=6.0)
     said = capsys.readouterr().out
     assert all(word in said for word in words)
+    assert len(said.splitlines()) <= 6
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("push_a_box", ("pushed 6", "by hand 0.441 N", "let go at 198 mm/s")),
+        ("trailer_on_a_rope", ("taut after 0.7", "pulls with 0.196 N", "= 0.196 N")),
+        ("user_force", ("motors at their limit", "by hand 0.40", "coasts on by")),
+        ("person_crossing", ("blind  : touched an obstacle", "looking: touched nothing")),
+        ("warehouse", ("robot_2", "nothing", "a pallet in the way of robot_0 was pushed")),
+    ],
+)
+def test_a_world_is_run_and_its_result_printed(
+    example: ModuleType, words: tuple[str, ...], capsys: pytest.CaptureFixture[str]
+) -> None:
+    example.main()
+    said = capsys.readouterr().out
+    assert all(word in said for word in words), said
     assert len(said.splitlines()) <= 6
 
 
@@ -144,6 +163,53 @@ def test_a_delay_line_moves_the_reference_as_its_twist_says(example: ModuleType)
     np.testing.assert_allclose(np.hypot(*moved[:, :2].T), twist[:, 0], atol=0.01)
     np.testing.assert_allclose(moved[:, 2], twist[:, 1], atol=1e-4)
     np.testing.assert_allclose(references[-1], [*at_rest], atol=1e-9)
+
+
+# The examples of worlds against calculations by hand
+
+
+@pytest.mark.parametrize(
+    ("name", "mass_kg", "friction"), [("push_a_box", 1.5, 0.03), ("push_a_box", 2.0, 0.02)]
+)
+def test_a_box_costs_its_friction_and_slides_as_far_as_it_allows(
+    example: ModuleType, mass_kg: float, friction: float
+) -> None:
+    box = example.BOX | {"mass_kg": mass_kg, "floor_friction": friction}
+    found, without = example.drive([box]), example.drive([])
+    grip = friction * 9807.0
+    assert found.motors_N - without.motors_N == pytest.approx(mass_kg * grip / 1000.0, rel=0.01)
+    assert found.let_go_mm_s == pytest.approx(example.SPEED_MM_S, rel=0.02)
+    # Each substep of 1 ms takes 1 ms · µ·g of the speed.
+    assert found.slid_mm == pytest.approx(found.let_go_mm_s**2 / (2 * grip), rel=0.01)
+    assert abs(found.turned_rad) < 1e-3
+
+
+@pytest.mark.parametrize("name", ["push_a_box"])
+def test_a_box_pushed_beside_its_centre_turns(example: ModuleType) -> None:
+    turned = [example.drive([example.BOX | {"x_mm": x}]).turned_rad for x in (-60.0, 60.0)]
+    assert turned[0] > 0.005  # the left robot pushes beside the centre, the right one outside of it
+    assert turned[1] == pytest.approx(-turned[0], rel=1e-3)
+
+
+@pytest.mark.parametrize("name", ["user_force"])
+@pytest.mark.parametrize("stiffness_N_m", [1.5, 4.0])
+def test_a_stiffer_spring_stops_a_robot_earlier_with_the_same_force(
+    example: ModuleType, stiffness_N_m: float
+) -> None:
+    at_limit, end = example.pull(example.SpringBalance(stiffness_N_m))
+    assert -at_limit.force_N == pytest.approx(0.404, rel=0.03)
+    coast_mm = at_limit.speed_mm_s * np.sqrt(1.29 / stiffness_N_m)
+    assert end.y_mm - at_limit.y_mm == pytest.approx(coast_mm, rel=0.08)
+    assert end.speed_mm_s == pytest.approx(0.0, abs=1e-6)
+    assert -end.force_N == pytest.approx(stiffness_N_m * end.y_mm / 1000.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["person_crossing"])
+@pytest.mark.parametrize("start_s", [0.5, 1.5, 3.0, 6.0])
+def test_a_robot_that_looks_is_not_touched(example: ModuleType, start_s: float) -> None:
+    time_s, touched, _ = example.drive(start_s, looking=True)
+    assert touched == tlf_env.TouchedBy.NOTHING
+    assert time_s == pytest.approx(example.HORIZON_S)
 
 
 @pytest.mark.parametrize("name", ["quickstart_parallel", "custom_estimator"])

@@ -15,14 +15,16 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Polygon
 
 from baselines import ReferencePolicy
 from baselines.runs import figures
 from baselines.runs.panels import MOST_POINTS, MOST_SHOWN, robot_colour, thinned, title
 from baselines.runs.plane import body_polygons, snapshot_rows
 from baselines.runs.run import Record, run_policy
+from baselines.runs.world import colour, moving_borders, pushed_borders, world_handles
 from tlf_env import load_scenario
+from tlf_env.rendering.looks import CRATE, MOVER, SLIPPERY, WALL
 
 ALL = {"overview", "paths", "errors", "functionals", "wheels", "slip", "time_gap"}
 UNITS = ("mm", "s", "rad", "mm/s", "rad/s", "N·mm", "mm·s", "rad·s")
@@ -36,6 +38,45 @@ MIXED: list[dict[str, Any]] = [
 ]
 
 
+BOX_MM = ((-80.0, -110.0), (80.0, -110.0), (80.0, 60.0), (-80.0, 60.0))
+WORLD: dict[str, Any] = {
+    "trajectory": {
+        "type": "waypoints",
+        "points": [
+            [0, 0, 0],
+            [1, 30, 0],
+            [2, 120, 0],
+            [5, 600, 0],
+            [9, 1300, 0],
+        ],  # t_s, x_mm, y_mm
+    },
+    "robots": [{}, {"outline_polygon_mm": BOX_MM}],
+    "time_gap_s": 3.0,
+    "horizon_s": 7.0,
+    "world": {
+        "walls": [{"points_mm": [[-900, -500], [1500, -500], [1500, 800]], "thickness_mm": 60}],
+        "obstacles": [{"shape": {"type": "circle", "radius_mm": 100}, "x_mm": 200, "y_mm": 400}],
+        "pushables": [
+            {
+                "shape": {"type": "box", "width_mm": 200, "length_mm": 300},
+                "x_mm": 500,
+                "y_mm": 0,
+                "mass_kg": 0.2,
+                "floor_friction": 0.05,
+            }
+        ],
+        "moving": [
+            {
+                "shape": {"type": "circle", "radius_mm": 90},
+                "points_mm": [[-600, 600], [1200, 600]],
+                "speed_mm_s": 150,
+            }
+        ],
+        "patches": [{"x_mm": -600, "y_mm": 100, "radius_mm": 150, "friction_scale": 0.5}],
+    },
+}
+
+
 class Away:
     """Drives off the reference as fast as it can, turning all the time."""
 
@@ -46,6 +87,8 @@ class Away:
 @cache
 def record(kind: str) -> Record:
     policy: Any = ReferencePolicy()
+    if kind == "world":
+        return run_policy(load_scenario(WORLD), policy, name="test")
     overrides: dict[str, Any] = {"robots": 3, "horizon_s": 7.0}
     if kind == "lost":
         policy, overrides = Away(), {"robots": 3, "horizon_s": 12.0, "lost_beyond_mm": 300.0}
@@ -195,7 +238,7 @@ def test_nothing_lies_beyond_the_limits(kind: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["overview", "paths", "errors", "functionals"])
-@pytest.mark.parametrize("kind", ["1", "3", "20", "20 lost", "3 slim"])
+@pytest.mark.parametrize("kind", ["1", "3", "20", "20 lost", "3 slim", "world"])
 def test_texts_stay_clear_of_the_axes_and_of_each_other(kind: str, name: str) -> None:
     run = record(kind.split()[0])
     if kind.endswith("lost"):  # the longest names
@@ -376,3 +419,79 @@ def test_very_many_robots_get_a_spread_of_rows() -> None:
 def test_pyplot_is_left_alone() -> None:
     code = "import sys, baselines.runs.figures; sys.exit('matplotlib.pyplot' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
+
+
+# --- the world -------------------------------------------------------------------------------------
+
+
+def pixels(figure: Figure, points_mm: list[tuple[float, float]]) -> list[np.ndarray]:
+    """Colours, 0 to 1, at places of the plane."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    image = np.asarray(canvas.buffer_rgba())[::-1, :, :3] / 255
+    at = figure.axes[0].transData.transform(points_mm).astype(int)
+    return [image[row, column] for column, row in at.tolist()]
+
+
+def test_the_world_is_where_the_scenario_says() -> None:
+    run = record("world")
+    assert run.objects is not None
+    pushed, person = run.objects[-1, :, :2].tolist()
+    places = [(0.0, -500.0), (1500.0, 300.0), (210.0, 410.0), tuple(pushed), tuple(person)]
+    wanted = [WALL, WALL, WALL, CRATE, MOVER, SLIPPERY]
+    found = pixels(figures.paths(run), [*places, (-600.0, 100.0)])
+    for here, colour_there in zip(found, wanted, strict=True):
+        np.testing.assert_allclose(here, colour(colour_there), atol=0.01)
+
+
+def test_things_are_shown_where_they_were_and_where_they_are() -> None:
+    run = record("world")
+    assert run.objects is not None
+    assert run.objects[-1, 0, 0] > run.objects[0, 0, 0] + 50.0  # it was pushed
+    plane = figures.overview(run).axes[0]
+    shown = [path.vertices for part in plane.collections for path in part.get_paths()]
+    rows = snapshot_rows(run)
+    things = pushed_borders(run, 0) + pushed_borders(run, -1)
+    things += [one for row in rows for one in moving_borders(run, row)]
+    assert len(things) == 2 + len(rows)
+    for thing in things:
+        assert any(len(one) == len(thing) + 1 and np.allclose(one[:-1], thing) for one in shown)
+    (course,) = (line for line in plane.lines if line.get_linestyle() == "--")
+    assert course.get_xydata().tolist() == WORLD["world"]["moving"][0]["points_mm"]
+
+
+def test_the_legend_names_what_the_world_has_and_no_more() -> None:
+    wanted = [
+        "wall or obstacle",
+        "can be pushed, at the start",
+        "can be pushed, at the end",
+        "moving obstacle, its path",
+        "tyre friction × 0.5",
+    ]
+    run = record("world")
+    for draw in (figures.overview, figures.paths):
+        texts = [text.get_text() for text in draw(run).legends[0].get_texts()]
+        assert texts[-len(wanted) :] == wanted
+    assert world_handles(record("3")) == []
+    assert not any(path.get_zorder() < 2 for path in figures.paths(record("3")).axes[0].collections)
+
+
+def test_the_plane_contains_the_world() -> None:
+    plane = figures.overview(record("world")).axes[0]
+    (left, right), (low, high) = plane.get_xlim(), plane.get_ylim()
+    assert left < -930
+    assert right > 1530
+    assert low < -530
+    assert high > 830
+
+
+def test_a_polygonal_outline_is_drawn_as_one() -> None:
+    run = record("world")
+    plane = figures.paths(run).axes[0]
+    (outline,) = (patch for patch in plane.patches if isinstance(patch, Polygon))
+    theta, c = run["theta_rad"][-1, 1], (run["x_mm"][-1, 1], run["y_mm"][-1, 1])
+    e, f = (np.cos(theta), np.sin(theta)), (-np.sin(theta), np.cos(theta))
+    np.testing.assert_allclose(outline.get_xy()[:-1], c + np.array(BOX_MM) @ np.array([e, f]))
+    nose = body_polygons(run, -1, 1)[3]
+    ahead = (nose - c) @ np.array(f)
+    assert ahead.max() == pytest.approx(0.95 * 60.0)

@@ -59,7 +59,7 @@ def times(of):
     return np.arange(of.horizon_steps + 1) * PERIOD_S
 
 
-def metrics(of, lost_at_s=None, touched_at_s=None, **columns):
+def metrics(of, lost_at_s=None, touched_at_s=None, touched_by=None, **columns):
     """Metrics of a run whose columns are zero but for those given, ``(time,)`` or ``(time, robot)``."""
     t_s, n = times(of), of.robot_count
     rows = {name: np.zeros((len(t_s), n)) for name in NAMES}
@@ -74,6 +74,7 @@ def metrics(of, lost_at_s=None, touched_at_s=None, **columns):
         rows,
         never if lost_at_s is None else np.array(lost_at_s),
         never if touched_at_s is None else np.array(touched_at_s),
+        touched_by,
     )
 
 
@@ -223,6 +224,16 @@ def test_score_is_zero_from_the_moment_of_lost_or_touched():
     assert [m.score for m in found] == pytest.approx(expected)
     assert [m.lost for m in found] == [True, False, True]
     assert [m.touched for m in found] == [False, True, True]
+
+
+def test_what_was_touched_has_a_name_and_counts_alike():
+    of = scenario(robots=4)
+    touched = {"touched_at_s": [20.0, 20.0, 20.0, math.inf]}
+    found = metrics(of, touched_by=np.array([1, 2, 3, 0], dtype=np.int8), **touched)
+    assert [m.touched_by for m in found] == ["robot", "wall", "obstacle", None]
+    assert [m.touched for m in found] == [True, True, True, False]
+    assert len({m.score for m in found[:3]}) == 1
+    assert [m._replace(touched_by=None) for m in found] == metrics(of, **touched)
 
 
 def test_lost_is_also_an_rms_above_100_mm_in_the_last_30_percent():

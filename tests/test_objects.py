@@ -152,6 +152,29 @@ def test_a_reset_puts_objects_back_and_the_episode_repeats():
     assert env.space is space
 
 
+def test_a_reset_puts_back_what_hangs_on_a_robot_and_forgets_forces():
+    env = environment(robots=1, disturbance="noise")
+    poses = {"poses": [[0.0, 0.0, 0.0]]}
+    env.reset(seed=0, options=poses)
+    trailer = box(env, (0.0, -350.0), mass=1.0)
+    robot = env.robot_bodies["robot_0"]
+    env.space.add(pymunk.SlideJoint(robot, trailer, (0, -60), (0, 75), 0.0, 250.0))
+
+    def episode():
+        env.reset(seed=3, options=poses)
+        rows = []
+        for _ in range(100):
+            *_, infos = env.step({"robot_0": np.array([0.2, 0.02])})
+            rows.append([places(infos), tuple(trailer.position), [trailer.angle]])
+        return rows
+
+    first = episode()
+    assert first[-1][1] != (0.0, -350.0)
+    for body in (robot, trailer):
+        body.apply_force_at_world_point((3000.0, 0.0), body.position)
+    assert same(episode(), first)
+
+
 @pytest.mark.parametrize("duplicate", [copy.deepcopy, lambda env: pickle.loads(pickle.dumps(env))])
 def test_a_copy_takes_the_objects_along(duplicate):
     env = environment()

@@ -29,7 +29,7 @@ COUNT, RANGE_MM = 16, 1000.0
 RADIUS_MM, BEHIND_MM = 110.0, 30.0  # of the outline
 EXACT = {"dtype": "float64", "disturbance": "none", "end_on": ()}
 HORIZON_S = 10.0
-PLANTS = ("pymunk", "batch", "kinematic")
+PLANTS = ("pymunk", "batch", "kinematic", "chipmunk")
 RECTANGLE = [[-80.0, -90.0], [80.0, -90.0], [80.0, 60.0], [-80.0, 60.0]]
 
 
@@ -290,6 +290,7 @@ SOMEWHERE = {
         {"disturbance": "combined-medium", "plant": "batch"},
         {"observation": "sensor", "disturbance": "noise"},
         {"plant": "kinematic"},
+        {"plant": "chipmunk", "world": SOMEWHERE},
         {"action": "residual"},
     ],
     ids=str,

@@ -13,14 +13,16 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import pymunk
 import pytest
 
 import tlf_env
 from tlf_env.physics.parameters import RobotParameters
-from tlf_env.rendering.drawing import FLOOR
-from tlf_env.rendering.looks import NOSE, robot_colours
+from tlf_env.physics.shapes import PlacedShape
+from tlf_env.rendering.drawing import FLOOR, clipped
+from tlf_env.rendering.looks import CRATE, MOVER, NOSE, WALL, robot_colours
 from tlf_env.rendering.renderer import ALARM, Renderer, round_length
-from tlf_env.rendering.scene import Scene
+from tlf_env.rendering.scene import Scene, scene_of
 
 pygame = pytest.importorskip("pygame")
 
@@ -46,6 +48,8 @@ def make_scene(robots: int = 3, t_s: float = 0.0, **changes: Any) -> Scene:
         "reference_theta_rad": np.full(robots, -math.pi / 2),
         "lost": np.zeros(robots, dtype=bool),
         "touched": np.zeros(robots, dtype=bool),
+        "touched_by": np.zeros(robots, dtype=np.int8),
+        "objects": (),
     }
     for axis in ("x_mm", "y_mm", "theta_rad"):
         fields[f"ghost_{axis}"] = np.full(robots, np.nan)
@@ -154,6 +158,13 @@ def test_a_slipping_wheel_is_marked_the_stronger_the_faster(wheel: str) -> None:
 )
 def test_everything_in_a_scene_shows(change: dict[str, Any]) -> None:
     assert (draw(make_scene()) != draw(make_scene(**change))).any()
+
+
+def test_what_a_robot_touched_is_written_beside_it() -> None:
+    touched = {"touched": np.array([False, True, False])}
+    pictures = [draw(make_scene(**touched, touched_by=np.array([0, by, 0]))) for by in range(4)]
+    for i, picture in enumerate(pictures):
+        assert all((picture != other).any() for other in pictures[:i])
 
 
 def test_ghosts_of_followers_show_in_their_colour() -> None:
@@ -369,7 +380,7 @@ def test_the_scene_of_a_formation_is_its_truth(robots: int) -> None:
     state = env.formation.state()
     assert np.array_equal(scene.x_mm, state[:, 0])
     assert np.allclose(np.sin(scene.theta_rad), state[:, 2])
-    assert all(np.shape(field) == (robots,) for field in scene[1:])
+    assert all(np.shape(field) == (robots,) for field in scene[1:-1])
     assert (scene.wheel_angle_l_rad > 0).all()
     assert np.isnan(scene.ghost_x_mm[0])
     assert np.allclose(scene.ghost_x_mm[1:], gap_ago.x_mm[:-1])
@@ -531,3 +542,216 @@ def test_the_window_stays_closed_once_its_user_has_closed_it(drawings: list[floa
     env.reset(seed=1)
     assert not pygame.display.get_init()
     env.close()
+
+
+# --- the world -------------------------------------------------------------------------------------
+
+SQUARE = ((-300.0, 900.0), (300.0, 900.0), (300.0, 1500.0), (-300.0, 1500.0))
+FORMS = {
+    "circle": (((0.0, 1200.0),), 300.0),
+    "segment": (((-300.0, 1200.0), (300.0, 1200.0)), 100.0),
+    "polygon": (SQUARE, 0.0),
+    "rounded": (SQUARE[::-1], 50.0),
+}
+
+
+def pixel(renderer: Renderer, image: np.ndarray, x_mm: float, y_mm: float) -> tuple[int, ...]:
+    column, row = renderer._view.px(np.array([x_mm, y_mm])) / 2
+    return tuple(image[int(row), int(column)].tolist())
+
+
+@pytest.mark.parametrize("form", FORMS)
+@pytest.mark.parametrize(
+    ("kind", "colour"), [("fixed", WALL), ("loose", CRATE), ("moving", MOVER), ("zone", FLOOR)]
+)
+def test_a_thing_is_where_the_scene_says_and_to_scale(form: str, kind: Any, colour: Any) -> None:
+    corners_mm, radius_mm = FORMS[form]
+    thing = PlacedShape(kind, corners_mm, radius_mm)
+    renderer = make_renderer(1, close_up=None)
+    image = frame(renderer, make_scene(1, objects=(thing,)))
+    bare = draw(make_scene(1), close_up=None)
+    x_mm, y_mm = np.array(corners_mm).mean(axis=0)
+    assert pixel(renderer, image, x_mm + 40.0, y_mm + 20.0) == colour  # off grid and diagonals
+    away = np.abs(image.astype(int) - bare).max(axis=-1) > 0
+    rows, columns = np.nonzero(away)
+    scale = renderer._view.scale / 2
+    width_mm, height_mm = np.ptp(np.array(corners_mm), axis=0) + 2 * radius_mm
+    assert np.ptp(columns) + 1 == pytest.approx(width_mm * scale, abs=4)
+    assert np.ptp(rows) + 1 == pytest.approx(height_mm * scale, abs=4)
+
+
+def test_a_line_without_thickness_shows() -> None:
+    line = PlacedShape("fixed", ((-500.0, 1200.0), (500.0, 1250.0)), 0.0)
+    assert (draw(make_scene(objects=(line,))) != draw(make_scene())).any(axis=-1).sum() > 100
+
+
+def test_things_that_move_leave_nothing_behind() -> None:
+    kinds: Any = ("fixed", "loose", "moving")
+    renderer, bare = make_renderer(**BARE), draw(make_scene(), **BARE)
+    assert np.array_equal(frame(renderer, make_scene()), bare)
+    for k, kind in enumerate(kinds):
+        thing = PlacedShape(kind, ((100.0 * k, 1200.0),), 200.0)
+        shown = frame(renderer, make_scene(objects=(thing,)))
+        assert (shown != bare).any()
+        assert np.array_equal(frame(renderer, make_scene()), bare)
+
+
+def test_the_view_contains_a_room_but_not_the_whole_world() -> None:
+    wide = make_renderer(1, close_up=None)
+    room = tuple(
+        PlacedShape("fixed", ends, 20.0)
+        for ends in (((-2900.0, -2900.0), (2900.0, -2900.0)), ((-2900.0, 2900.0), (2900.0, 2900.0)))
+    )
+    image = frame(wide, make_scene(1, objects=room))
+    for y_mm in (-2900.0, 2900.0):
+        assert pixel(wide, image, -1000.0, y_mm) == WALL
+    far = PlacedShape("fixed", ((-1e9, 2000.0), (1e9, 1e9)), 20.0)
+    near = make_renderer(1, close_up=None)
+    frame(near, make_scene(1, objects=(far,)))
+    assert near._view.height / near._view.scale < 2 * (2000.0 + 1500.0) + 1000.0
+
+
+def test_the_view_stays_when_a_wall_is_added() -> None:
+    renderer = make_renderer(1)
+    frame(renderer, make_scene(1))
+    before = renderer._view
+    wall = PlacedShape("fixed", ((-2900.0, 1000.0), (2900.0, 1000.0)), 20.0)
+    image = frame(renderer, make_scene(1, 0.1, objects=(wall,)))
+    assert renderer._view == before
+    assert pixel(renderer, image, 700.0, 1000.0) == WALL
+    renderer.begin(PATH_MM)
+    frame(renderer, make_scene(1, objects=(wall,)))
+    assert renderer._view != before
+
+
+@pytest.mark.parametrize("far_mm", [1e4, 1e6, 1e12])
+def test_a_thing_of_any_size_is_cut_at_the_edges(far_mm: float) -> None:
+    corners = ((-far_mm, 1000.0), (far_mm, 1000.0), (far_mm, far_mm), (-far_mm, far_mm))
+    renderer = make_renderer(1, size_px=(480, 360))
+    image = frame(renderer, make_scene(1, objects=(PlacedShape("fixed", corners, 0.0),)))
+    assert pixel(renderer, image, 330.0, 1700.0) == WALL
+    assert pixel(renderer, image, 330.0, 830.0) == FLOOR
+
+
+def test_clipping_keeps_what_is_inside() -> None:
+    low, high = np.array([0.0, 0.0]), np.array([2.0, 1.0])
+    inside = np.array([(0.5, 0.1), (1.5, 0.1), (1.0, 0.9)])
+    assert np.array_equal(clipped(inside, low, high), inside)
+    assert not len(clipped(inside + 5.0, low, high))
+    whole = clipped(np.array([(-9.0, -9.0), (9.0, -9.0), (9.0, 9.0), (-9.0, 9.0)]), low, high)
+    assert {tuple(corner) for corner in whole.tolist()} == {(0, 0), (2, 0), (2, 1), (0, 1)}
+
+
+BOX_MM = ((-80.0, -110.0), (80.0, -110.0), (80.0, 60.0), (-80.0, 60.0))
+
+
+def test_a_polygonal_outline_is_drawn_to_scale() -> None:
+    box = RobotParameters(outline_polygon_mm=BOX_MM)
+    renderer = Renderer([box], PATH_MM, mode="rgb_array", fps=50.0, close_up=None)
+    scene = make_scene(1, theta_rad=np.zeros(1))
+    image, nowhere = frame(renderer, scene), scene._replace(x_mm=np.array([np.nan]))
+    away = np.abs(image.astype(int) - frame(renderer, nowhere)).max(axis=-1) > 0
+    away[:100] = False  # the text
+    rows, columns = np.nonzero(away)
+    scale = renderer._view.scale / 2
+    # the wheels stand out of the box to both sides
+    assert np.ptp(columns) + 1 == pytest.approx((156 + 22) * scale, abs=4)
+    assert np.ptp(rows) + 1 == pytest.approx(170 * scale, abs=4)
+    touched = scene._replace(touched=np.array([True]))
+    red = np.abs(frame(renderer, touched).astype(int) - ALARM).max(axis=-1) <= 60
+    red[:100] = False
+    rows, columns = np.nonzero(red)
+    assert np.ptp(columns) + 1 == pytest.approx(160 * scale, abs=4)
+    assert np.ptp(rows) + 1 == pytest.approx(170 * scale, abs=4)
+
+
+WORLD = {
+    "walls": [{"points_mm": [[-900, 700], [3600, 700]], "thickness_mm": 40}],
+    "obstacles": [{"shape": {"type": "circle", "radius_mm": 80}, "x_mm": 300, "y_mm": -500}],
+    "pushables": [
+        {
+            "shape": {"type": "box", "width_mm": 200, "length_mm": 200},
+            "x_mm": 250,
+            "y_mm": 0,
+            "mass_kg": 0.2,
+            "floor_friction": 0.05,
+        }
+    ],
+    "moving": [
+        {
+            "shape": {"type": "circle", "radius_mm": 100},
+            "points_mm": [[-400, -800], [900, -800]],
+            "speed_mm_s": 300,
+            "random_start": True,
+        }
+    ],
+}
+DRIVEN = {"disturbance": "none", "world": WORLD, "end_on": (), "robots": 2}
+
+
+@pytest.mark.filterwarnings("ignore::tlf_env.task.warn.ReferenceWarning")
+def test_a_look_does_not_change_a_run() -> None:
+    seen: list[list[np.ndarray]] = []
+    for looks in (False, True):
+        env = tlf_env.parallel_env(ROUTE, render_mode="rgb_array", **DRIVEN)
+        env.reset(seed=4)
+        rows = []
+        for _ in range(100):
+            env.step({agent: np.array([0.8, 0.0]) for agent in env.agents})
+            if looks:
+                env.render()
+            rows += [env.state(), env.formation.plant.object_poses(env.formation.step_count)]
+        seen.append(rows)
+    pushed = seen[0][-1][0, 0] - seen[0][1][0, 0]
+    assert pushed > 50.0
+    for one, other in zip(*seen, strict=True):
+        assert np.array_equal(one, other)
+
+
+@pytest.mark.filterwarnings("ignore::tlf_env.task.warn.ReferenceWarning")
+def test_the_objects_of_a_scene_are_those_of_the_space() -> None:
+    env = tlf_env.parallel_env(ROUTE, **DRIVEN)
+    env.reset(seed=4)
+    for _ in range(40):
+        env.step({agent: np.array([0.8, 0.0]) for agent in env.agents})
+    objects = scene_of(env.formation).objects
+    assert [one.kind for one in objects] == ["fixed", "fixed", "loose", "moving"]
+    space = env.space  # puts all bodies where they are now
+    places = {body.body_type: body.position for body in list(space.bodies)[2:]}
+    crate, person = objects[2:]
+    assert np.allclose(np.mean(crate.corners_mm, axis=0), places[pymunk.Body.DYNAMIC])
+    assert np.allclose(person.corners_mm[0], places[pymunk.Body.KINEMATIC], atol=1e-9)
+    poses = env.formation.plant.object_poses(env.formation.step_count)
+    assert np.array_equal(poses[1, :2], person.corners_mm[0])
+
+
+def test_what_a_user_puts_into_the_space_shows() -> None:
+    env = tlf_env.parallel_env(ROUTE, robots=2, end_on=())
+    env.reset(seed=4)
+    space, bodies = env.space, env.robot_bodies
+    assert scene_of(env.formation).objects == ()
+    trailer = pymunk.Body(1.0, 1000.0)
+    trailer.position = bodies["robot_1"].local_to_world((-300.0, 0.0))
+    turntable = pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+    turntable.position, turntable.angular_velocity = (1000.0, 1000.0), 1.0
+    bumper = pymunk.Segment(bodies["robot_0"], (-100.0, 90.0), (100.0, 90.0), 5.0)
+    zone = pymunk.Circle(space.static_body, 100.0, (2000.0, 2000.0))
+    zone.sensor = True
+    rope = pymunk.SlideJoint(trailer, bodies["robot_1"], (0.0, 0.0), (0.0, -80.0), 0.0, 400.0)
+    table = pymunk.Poly.create_box(turntable, (300.0, 100.0))
+    space.add(trailer, pymunk.Circle(trailer, 60.0), rope, bumper, zone, turntable, table)
+    space.add(pymunk.Segment(space.static_body, (500.0, 2000.0), (900.0, 2000.0), 0.0))
+    objects = scene_of(env.formation).objects
+    kinds = sorted(one.kind for one in objects)
+    assert kinds == ["fixed", "link", "loose", "loose", "moving", "zone"]
+    for _ in range(25):
+        env.step({agent: np.array([0.5, 0.0]) for agent in env.agents})
+    later = scene_of(env.formation).objects
+    moved = {one.kind for one, other in zip(objects, later, strict=True) if one != other}
+    assert moved == {"link", "loose", "moving"}
+    link = next(one for one in later if one.kind == "link")
+    ends = [trailer.position, env.robot_bodies["robot_1"].local_to_world((0.0, -80.0))]
+    assert np.allclose(link.corners_mm, ends)
+    ahead = next(one for one in later if one.radius_mm == 5.0)
+    robot = env.robot_bodies["robot_0"]
+    assert np.allclose(ahead.corners_mm, [robot.local_to_world((x, 90.0)) for x in (-100.0, 100.0)])

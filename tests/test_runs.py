@@ -1,11 +1,14 @@
 """What the commands share: ranges of seeds, failed runs, the recorded command, ``python -m baselines``."""
 
+import json
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from baselines import ReferencePolicy
+from baselines.runs.files import write_mat, write_record
 from baselines.runs.outcome import failed
 from baselines.runs.provenance import command_line, installed_versions, versions
 from baselines.runs.run import SEEDS_PER_BLOCK, run_policy, run_seeds, seed_blocks
@@ -15,6 +18,8 @@ from baselines.runs.seed_ranges import (
     TRAINING_SEEDS,
     check_seeds,
 )
+from baselines.tables import metrics_table
+from tlf_env.physics.world import MovingObstacle
 from tlf_env.task.scenario import load_scenario
 
 
@@ -97,3 +102,120 @@ def test_any_number_of_seeds_runs_side_by_side(count):
         assert record.metrics() == alone.metrics()
         for name, column in alone.columns.items():
             assert (record[name] == column).all(), name
+
+
+# --- the world -------------------------------------------------------------------------------------
+
+WALL = {"points_mm": [[-2000, 400], [2000, 400]]}
+AHEAD = {
+    "trajectory": {"type": "waypoints", "points": [[0, 0, 0], [1, 0, 100], [4, 0, 1000]]},
+    "robots": 1,
+    "horizon_s": 3.0,
+    "disturbance": "none",
+}
+
+
+def run_ahead(world, **fields):
+    return run_policy(load_scenario({**AHEAD, **fields, "world": world}), ReferencePolicy())
+
+
+@pytest.mark.filterwarnings("ignore::tlf_env.task.warn.ReferenceWarning")
+@pytest.mark.parametrize(
+    ("world", "by"),
+    [
+        ({}, None),
+        ({"walls": [WALL]}, "wall"),
+        (
+            {"obstacles": [{"shape": {"type": "circle", "radius_mm": 50}, "x_mm": 0, "y_mm": 400}]},
+            "wall",
+        ),
+        (
+            {
+                "moving": [
+                    {
+                        "shape": {"type": "circle", "radius_mm": 50},
+                        "points_mm": [[0, 400], [0, 390]],
+                        "speed_mm_s": 1,
+                    }
+                ]
+            },
+            "obstacle",
+        ),
+        (
+            {
+                "pushables": [
+                    {
+                        "shape": {"type": "circle", "radius_mm": 50},
+                        "x_mm": 0,
+                        "y_mm": 400,
+                        "mass_kg": 0.1,
+                    }
+                ]
+            },
+            None,
+        ),
+    ],
+    ids=["nothing", "wall", "post", "moving", "pushed"],
+)
+def test_a_run_says_what_was_touched(world, by, tmp_path):
+    record = run_ahead(world)
+    (robot,) = record.metrics()
+    assert (robot.touched, robot.touched_by) == (by is not None, by)
+    assert record.contact == failed([robot]) == robot.touched
+    write_record(record, tmp_path)
+    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
+    assert summary["robots"]["robot_0"]["touched_by"] == by
+    (cell,) = metrics_table(record).columns[-1].cells
+    assert cell == (", ".join(["lost"] * robot.lost + [by] * robot.touched) or "ok")
+
+
+@pytest.mark.filterwarnings("ignore::tlf_env.task.warn.ReferenceWarning")
+def test_runs_side_by_side_say_what_was_touched_too():
+    fields = {**AHEAD, "plant": "batch", "horizon_s": 3.0, "preview_s": (), "robots": 2}
+    scenario = load_scenario({**fields, "time_gap_s": 1.0, "world": {"walls": [WALL]}})
+    for record in run_seeds(scenario, ReferencePolicy(), range(3)):
+        alone = run_policy(scenario, ReferencePolicy(), record.seed)
+        assert record.metrics() == alone.metrics()
+        assert record.metrics()[0].touched_by == "wall"
+
+
+MOVING = {
+    "shape": {"type": "circle", "radius_mm": 50},
+    "points_mm": [[600, 0], [600, 500]],
+    "speed_mm_s": 100,
+    "start_s": 1.0,
+}
+CRATE = {
+    "shape": {"type": "box", "width_mm": 100, "length_mm": 100},
+    "x_mm": 0,
+    "y_mm": 200,
+    "angle_rad": 0.5,
+    "mass_kg": 0.1,
+    "floor_friction": 0.1,
+}
+
+
+def test_a_record_has_the_poses_of_what_can_move(tmp_path):
+    record = run_ahead({"moving": [MOVING], "pushables": [CRATE]})
+    assert record.objects.shape == (len(record.t_s), 2, 3)
+    pushed, moving = record.objects[:, 0], record.objects[:, 1]
+    assert pushed[0].tolist() == [0.0, 200.0, 0.5]
+    assert pushed[-1, 1] > 300.0
+    course = MovingObstacle(**MOVING).course()
+    wanted = [(*course.at(1.0 + t_s), 0.0) for t_s in record.t_s.tolist()]
+    np.testing.assert_allclose(moving, wanted)
+    write_record(record, tmp_path)
+    with np.load(tmp_path / "trajectory.npz") as arrays:
+        assert (arrays["objects"] == record.objects).all()
+    write_mat(record, tmp_path)
+    from scipy.io import loadmat
+
+    assert (loadmat(tmp_path / "trajectory.mat")["objects"] == record.objects).all()
+
+
+def test_without_things_that_move_a_record_is_as_before(tmp_path):
+    record = run_ahead({"walls": [{"points_mm": [[900, 0], [900, 900]]}]})
+    assert record.objects is None
+    write_record(record, tmp_path)
+    with np.load(tmp_path / "trajectory.npz") as arrays:
+        assert set(arrays.files) == {"t_s", "leader_reference_mm", *record.columns}

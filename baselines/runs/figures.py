@@ -37,6 +37,7 @@ from baselines.runs.panels import (
 from baselines.runs.plane import PLANE_IN, draw_plane, plane_width_in, snapshot_rows
 from baselines.runs.run import Record
 from baselines.runs.style import DPI, METADATA, PALE, tidy
+from baselines.runs.world import world_handles
 from tlf_env.common.files import atomic
 
 COMMAND_COLOUR, ACTUAL_COLOUR = "#E69F00", "#0072B2"
@@ -77,7 +78,8 @@ def overview(record: Record) -> Figure:
     position.tick_params(labelbottom=False)
     settle_label(record, position, ", RMS from here")
     time_axis(record, other)
-    legend_below(figure, position.get_legend_handles_labels()[0], columns=5)
+    handles = [*position.get_legend_handles_labels()[0], *world_handles(record)]
+    legend_below(figure, handles, columns=5)
     return figure
 
 
@@ -86,7 +88,7 @@ def paths(record: Record) -> Figure:
     figure = new_figure(record, 1.2 * plane_width_in(record) + 0.8, 1.2 * PLANE_IN + 0.8)
     axes = figure.subplots()
     draw_plane(record, axes, [len(record.t_s) - 1])
-    legend_below(figure, axes.get_legend_handles_labels()[0])
+    legend_below(figure, [*axes.get_legend_handles_labels()[0], *world_handles(record)])
     return figure
 
 

@@ -9,7 +9,7 @@ from tlf_env.task.metrics import RobotMetrics
 
 
 def failed(robots: Iterable[RobotMetrics | Mapping[str, Any]]) -> bool:
-    """Whether a run failed: a robot is lost or touched another.
+    """Whether a run failed: a robot is lost, or touched another, a wall or an obstacle.
 
     Parameters
     ----------

@@ -9,18 +9,28 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.collections import PolyCollection
 from matplotlib.colors import to_rgb
-from matplotlib.patches import Circle
+from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 
 from baselines.runs.panels import MOST_POINTS, robot_colour, round_above
 from baselines.runs.run import Record
 from baselines.runs.style import MARKERS, tidy
-from tlf_env.rendering.looks import CASTOR_WIDTH_MM, DRIVE_WHEEL_WIDTH_MM, NOSE
+from baselines.runs.world import NEAR_MM, draw_world, occupied
+from baselines.runs.world import extent as world_extent
+from tlf_env.rendering.looks import (
+    CASTOR_WIDTH_MM,
+    DRIVE_WHEEL_WIDTH_MM,
+    NOSE,
+    front_mm,
+    outline_mm,
+)
 
 PLANE_IN = 5.6  # height of the plane
 SLIMMEST, WIDEST = 0.6, 1.8  # its width by its height
+WORLD_ROOM = 0.3  # of the room around the robots, around the world
 SNAPSHOTS = 4  # times at which the robots are drawn, at most
 SNAPSHOT_ROOM = 1.5  # between robots of different times, in outline diameters
+TEXT_ROOMS = (1.5, 2.5, 3.5, 5.0)  # between a robot and its time, in outline radii
 FADED = 0.5
 
 
@@ -35,7 +45,6 @@ def body_polygons(record: Record, row: int, number: int) -> list[np.ndarray]:
     theta = record["theta_rad"][row, number]
     body, fork = _axes_of(theta), _axes_of(theta + record["castor_rad"][row, number])
     half_mm = robot.axle_width_mm / 2
-    front_mm = robot.outline_front_mm
     tyre = _rectangle(DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm)
     castor = _rectangle(CASTOR_WIDTH_MM, 2 * robot.castor_radius_mm)
     pivot = c - robot.castor_pivot_mm * body[1]
@@ -43,7 +52,7 @@ def body_polygons(record: Record, row: int, number: int) -> list[np.ndarray]:
         c - half_mm * body[0] + tyre @ body,
         c + half_mm * body[0] + tyre @ body,
         pivot + (castor - (0, robot.castor_trail_mm)) @ fork,
-        c + front_mm * np.array(NOSE) @ body,
+        c + front_mm(robot) * np.array(NOSE) @ body,
     ]
 
 
@@ -85,7 +94,12 @@ def _extent(record: Record) -> tuple[np.ndarray, np.ndarray]:
     """Lower left and upper right corner of the plane, mm, with room for the bodies."""
     everything = np.concatenate([_places(record).reshape(-1, 2), record.leader])
     room_mm = 2.5 * _largest_radius_mm(record)
-    low, high = everything.min(axis=0) - room_mm, everything.max(axis=0) + room_mm
+    low, high = everything.min(axis=0), everything.max(axis=0)
+    world = np.clip(world_extent(record), low - NEAR_MM, high + NEAR_MM)
+    low, high = low - room_mm, high + room_mm
+    if len(world):
+        low = np.minimum(low, world.min(axis=0) - WORLD_ROOM * room_mm)
+        high = np.maximum(high, world.max(axis=0) + WORLD_ROOM * room_mm)
     width, height = size = high - low
     more = np.maximum(size, (height * SLIMMEST, width / WIDEST)) - size
     return low - more / 2, high + more / 2
@@ -99,8 +113,9 @@ def plane_width_in(record: Record) -> float:
 
 
 def draw_plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
-    """The leader's reference, every path, and the robots at ``rows``; those at the first row are solid."""
+    """World, leader's reference, every path, and the robots at ``rows``; those at the first row are solid."""
     n, low_high = record.robots, np.stack(_extent(record))
+    draw_world(record, axes, rows)
     every = max(1, len(record.t_s) // MOST_POINTS)
     axes.plot(*record.leader[::every].T, color="0.8", lw=5.0, zorder=1, label="leader's reference")
     for i in range(n):  # later robots on top and thinner, so that coinciding paths are all visible
@@ -126,28 +141,43 @@ def draw_plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
 def _draw_body(record: Record, axes: Axes, row: int, number: int, strength: float) -> None:
     robot = record.scenario.robot_models[number]
     line = 1 - strength * (1 - np.array(to_rgb(robot_colour(record, number))))
-    centre = np.array([0, -robot.outline_offset_mm]) @ _axes_of(record["theta_rad"][row, number])
-    x, y = _places(record)[row, number] + centre
+    turned = _axes_of(record["theta_rad"][row, number])
     z = 2 + strength
     fill, dark = 1 - 0.3 * (1 - line), 1 - strength * (1 - 0.7 * line)
-    axes.add_patch(Circle((x, y), robot.outline_radius_mm, fc=fill, ec=line, zorder=z))
+    if robot.outline_polygon_mm is None:
+        x, y = _places(record)[row, number] + np.array([0, -robot.outline_offset_mm]) @ turned
+        axes.add_patch(Circle((x, y), robot.outline_radius_mm, fc=fill, ec=line, zorder=z))
+    else:
+        corners = _places(record)[row, number] + outline_mm(robot) @ turned
+        axes.add_patch(Polygon(corners, fc=fill, ec=line, zorder=z))
     axes.add_collection(PolyCollection(body_polygons(record, row, number), fc=[dark], zorder=z))
 
 
 def _time_label(record: Record, axes: Axes, row: int, rows: Sequence[int]) -> None:
     """The time beside the leader, at the side farthest from robots and paths."""
     places, (low, high) = _places(record), _extent(record)
+    things = occupied(record, rows)
     busy = np.concatenate([places[:: max(1, len(places) // 1000)], places[list(rows)]])
+    busy = np.concatenate([busy.reshape(-1, 2), things])
     half_mm = np.array([0.3, 0.12]) * (high - low)[1] / PLANE_IN  # of the text
     turns = np.linspace(0, 2 * np.pi, 16, endpoint=False)
     sides = np.stack([np.cos(turns), np.sin(turns)], axis=-1)
     radius_mm = record.scenario.robot_models[0].outline_radius_mm
-    beside = places[row, 0] + sides * (1.5 * radius_mm + half_mm)
-    apart = np.linalg.norm(beside[:, None] - busy.reshape(-1, 2), axis=-1).min(axis=1)
-    inside = np.all((beside - half_mm > low) & (beside + half_mm < high), axis=1)
+    best, most = np.zeros(2), -np.inf
+    for room in TEXT_ROOMS if len(things) else TEXT_ROOMS[:1]:
+        beside = places[row, 0] + sides * (room * radius_mm + half_mm)
+        away = np.abs(beside[:, None] - busy)
+        apart = np.linalg.norm(away, axis=-1).min(axis=1)
+        inside = np.all((beside - half_mm > low) & (beside + half_mm < high), axis=1)
+        chosen = np.argmax(np.where(inside, apart, -1.0))
+        free = (away[chosen] / half_mm).max(axis=-1).min()  # 1: nothing is behind the text
+        if (inside[chosen] and free > most) or most == -np.inf:
+            best, most = beside[chosen], free
+        if most >= 1.0:
+            break
     axes.annotate(
         f"{record.t_s[row]:g} s",
-        tuple(beside[np.argmax(np.where(inside, apart, -1.0))]),
+        (float(best[0]), float(best[1])),
         ha="center",
         va="center",
         fontsize="small",

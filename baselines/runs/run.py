@@ -77,8 +77,13 @@ class Record:
     columns: dict[str, np.ndarray]  # each (time, robot)
     leader: np.ndarray  # (time, 2): the leader's reference path, mm
     lost_at_s: np.ndarray  # (robot,): when the error first passed lost_beyond_mm; infinite if never
-    touched_at_s: np.ndarray  # (robot,): when it first touched another robot; infinite if never
+    touched_at_s: (
+        np.ndarray
+    )  # (robot,): when it first touched a robot, wall or obstacle; else infinite
+    touched_by: np.ndarray  # (robot,): what that was, a TouchedBy
     options: Mapping[str, Any] | None = None  # of the reset
+    # (time, object, 3): x and y (mm) and angle (rad) of the world's pushables, then of its moving obstacles
+    objects: np.ndarray | None = None  # None if the world has neither
 
     def __getitem__(self, column: str) -> np.ndarray:
         return self.columns[column]
@@ -90,13 +95,18 @@ class Record:
 
     @property
     def contact(self) -> bool:
-        """Whether any two robots touched."""
+        """Whether any robot touched another, a wall or an obstacle."""
         return bool(np.isfinite(self.touched_at_s).any())
 
     def metrics(self) -> list[RobotMetrics]:
         """Metrics of every robot."""
         return robot_metrics(
-            self.scenario, self.t_s, self.columns, self.lost_at_s, self.touched_at_s
+            self.scenario,
+            self.t_s,
+            self.columns,
+            self.lost_at_s,
+            self.touched_at_s,
+            self.touched_by,
         )
 
     def string(self) -> StringMetrics:
@@ -136,14 +146,20 @@ def run_policy(
     a, steps = formation.arrays, scenario.horizon_steps
     tape = _Tape(a, steps)
     driver = _Driver(policy, scenario, a, name)
+    objects = [formation.plant.object_poses(0)]
     for k in range(1, steps + 1):
         a.actions[:] = driver.act()
         formation.step()
         tape.note(k, scenario.control_period_s)
+        objects.append(formation.plant.object_poses(k))
         if progress is not None:
             progress(k, steps)
     plain = {name: np.asarray(value).tolist() for name, value in (options or {}).items()} or None
-    return replace(tape.record(0, scenario, seed, name), options=plain)
+    return replace(
+        tape.record(0, scenario, seed, name),
+        options=plain,
+        objects=np.stack(objects) if objects[0].size else None,
+    )
 
 
 def run_seeds(
@@ -213,6 +229,7 @@ class _Tape:
         self._infos = np.zeros((lanes, steps + 1, n, len(FROM_INFO)))
         self._wheels = np.zeros((lanes, steps + 1, len(FROM_WHEELS), n))
         self._lost_at_s, self._touched_at_s = np.full((2, lanes, n), np.inf)
+        self._touched_by = np.zeros((lanes, n), dtype=np.int8)
         self.note(0, 0.0)
 
     def note(self, step: int, period_s: float) -> None:
@@ -228,6 +245,7 @@ class _Tape:
         if a.lost_now.any() or a.touched_now.any():
             self._lost_at_s[a.lost_now] = step * period_s
             self._touched_at_s[a.touched_now] = step * period_s
+            self._touched_by[a.touched_now] = a.touched_by[a.touched_now]
 
     def record(self, lane: int, scenario: Scenario, seed: int, policy: str) -> Record:
         """The record of a lane."""
@@ -243,6 +261,7 @@ class _Tape:
             leader=self._arrays.tables[0, : self._steps + 1, :2].copy(),
             lost_at_s=self._lost_at_s[lane],
             touched_at_s=self._touched_at_s[lane],
+            touched_by=self._touched_by[lane],
         )
 
 

@@ -14,6 +14,7 @@ from tlf_env.disturbances.channels import CHANNELS, Channel
 # Endings of a name, the longest first, and their units.
 UNITS = {
     "_kg_mm2": "kg·mm²",
+    "_per_s": "1/s",
     "_rad_s": "rad/s",
     "_mm_s": "mm/s",
     "_rad": "rad",

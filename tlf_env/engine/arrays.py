@@ -16,16 +16,18 @@ from tlf_env.engine.layout import (
     ROWS,
     Kind,
     Sample,
+    Traction,
     array_reader,
     array_writer,
     fields_of,
     rows_of,
 )
+from tlf_env.numerics.rows import reader, writer
 from tlf_env.onboard.estimator import ekf_constants
 from tlf_env.onboard.observer import Message, Reference
 from tlf_env.onboard.slip_estimator import slip_ekf_constants
 from tlf_env.onboard.wheel_loop import WheelLoopParameters, digital_wheel_loop
-from tlf_env.physics.vehicle import body
+from tlf_env.physics.vehicle import Floor, body
 from tlf_env.physics.world import capsule_rows
 from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
 from tlf_env.task.info import Info
@@ -74,6 +76,9 @@ class Arrays(NamedTuple):
     imposed: np.ndarray  # (channel, robot, lane): values set by an adversary, else NaN
     torques: np.ndarray  # (wheel, slot, robot, lane): ring over the longest dead time, mN·mm
     kinds: np.ndarray  # (robot, lane) int64: of each robot's action
+    inputs: (
+        np.ndarray
+    )  # (Traction and Floor, robot, lane) of a substep on plant `chipmunk`, else empty
     samples: np.ndarray  # (substep, Sample, robot, lane): sensor readings of a control step
     dropped: np.ndarray  # (slot, robot, lane) bool: whether that broadcast was lost
     messages: np.ndarray  # (Message, slot, robot, lane): ring over one gap
@@ -119,11 +124,16 @@ class Arrays(NamedTuple):
         return ring[:, step % ring.shape[1], :, : len(self.seeds)]
 
 
+FLOOR_INPUT = len(Traction._fields)  # where Floor begins in Arrays.inputs
+
 read_body = array_reader("body")
 read_motion, write_motion = array_reader("motion"), array_writer("motion")
 read_estimate, write_estimate = array_reader("estimate"), array_writer("estimate")
 read_slip = array_reader("slip")
-read_trace = array_reader("trace")
+read_contact = array_reader("contact")
+read_trace, write_trace = array_reader("trace"), array_writer("trace")
+read_traction, write_traction = reader(Traction), writer(Traction)  # of Arrays.inputs
+write_floor = writer(Floor, FLOOR_INPUT)
 read_wanted, write_wanted = array_reader("wanted"), array_writer("wanted")
 read_wanted_before = array_reader("wanted_before")
 write_wanted_before = array_writer("wanted_before")
@@ -244,6 +254,7 @@ def make_arrays(
         imposed=np.full((len(CHANNELS), robots, columns), np.nan),
         torques=np.zeros((2, dead + 1, robots, columns)),
         kinds=np.full((robots, columns), ACTION_KINDS[scenario.action], dtype=np.int64),
+        inputs=zeros(FLOOR_INPUT + len(Floor._fields) if scenario.plant == "chipmunk" else 0),
         samples=np.zeros((scenario.substeps, len(Sample._fields), robots, columns)),
         dropped=np.zeros((ring, robots, columns), dtype=np.bool_),
         messages=np.zeros((len(Message._fields), ring, robots, columns)),

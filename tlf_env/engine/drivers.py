@@ -14,8 +14,13 @@ from tlf_env.engine.arrays import (
     Arrays,
     Variants,
     read_body,
+    read_contact,
+    read_motion,
+    read_trace,
+    read_traction,
     read_wanted,
     write_command,
+    write_trace,
     write_wanted,
     write_wanted_before,
 )
@@ -35,6 +40,7 @@ from tlf_env.engine.radio import broadcast, delayed_message, next_reference
 from tlf_env.engine.rays import capsule_at, cast_rays, is_reading, meet, report_rays
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.starting import STARTED, clear, start_lane
+from tlf_env.engine.substeps import trace_drive
 from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import block, driver, fetch_add, law
 from tlf_env.numerics.philox import unit, words
@@ -293,8 +299,26 @@ def find_near(arrays: Arrays, first: int, last: int, near: np.ndarray, settings:
 
 @driver
 def actuate(arrays: Arrays, lane: int, substep: int, settings: Settings) -> None:
-    """The first half of a substep of a lane: everything up to the plant's new velocities and poses."""
+    """The first half of a substep of a lane: everything up to the plant's new velocities and poses.
+
+    On the plant ``chipmunk`` everything up to the plant, whose inputs are written.
+    """
     advance(arrays, np.full(1, lane), substep, substep + 1, True, False, settings)
+
+
+@driver
+def account(arrays: Arrays, lane: int, settings: Settings) -> None:
+    """The sums of torque and slip of a substep that the plant ``chipmunk`` has made."""
+    for robot in range(arrays.states.shape[1]):
+        trace = trace_drive(
+            read_trace(arrays.states, robot, lane),
+            read_body(arrays.constants, robot, lane).torque_limit,
+            read_traction(arrays.inputs, robot, lane),
+            read_motion(arrays.states, robot, lane),
+            read_contact(arrays.states, robot, lane),
+            settings.dt,
+        )
+        write_trace(arrays.states, robot, lane, trace)
 
 
 @driver

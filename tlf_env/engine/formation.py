@@ -19,14 +19,15 @@ from tlf_env.disturbances.channels import (
     number,
 )
 from tlf_env.engine import drivers, readout
-from tlf_env.engine.arrays import Arrays, Variants, make_arrays, make_variants
+from tlf_env.engine.arrays import FLOOR_INPUT, Arrays, Variants, make_arrays, make_variants
 from tlf_env.engine.excerpt import empty_excerpt
-from tlf_env.engine.layout import rows_of
+from tlf_env.engine.layout import Traction, rows_of
 from tlf_env.engine.outside_parts import Parts, part_factories
 from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import IN_WALL, OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.parts import Factory, real_numbers
+from tlf_env.physics.chipmunk_plant import ChipmunkPlant
 from tlf_env.physics.pymunk_plant import (
     NO_OBJECTS,
     OUT_OF_REACH,
@@ -72,6 +73,7 @@ TOUCHED_BY = {
 USUAL_START = Start(poses=None, phases_s=None)
 ALONE = np.ones(1, dtype=np.bool_)
 NO_POSES = np.zeros((0, 0, 3))
+DELIVERED = [Traction._fields.index(name) for name in ("delivered_l", "delivered_r")]
 
 
 class Formation:
@@ -87,7 +89,8 @@ class Formation:
         self._table = reference_table(scenario)
         self.arrays: Arrays = make_arrays([scenario], self._table)
         self._variants = make_variants([scenario])
-        self.plant = PymunkPlant(scenario.robot_models, scenario.world, scenario.control_period_s)
+        kind = ChipmunkPlant if scenario.plant == "chipmunk" else PymunkPlant
+        self.plant = kind(scenario.robot_models, scenario.world, scenario.control_period_s)
         self._parts = Parts(part_factories(scenario, parts or {}), scenario)
         self._settings = make_settings(scenario)
         self._left = drivers.lanes_to_step(0, 1)
@@ -210,7 +213,12 @@ class Formation:
             raise ValueError(
                 f"robot_{result}: the action must be finite, got {arrays.actions[0, result].tolist()}"
             )
-        self._substep_by_substep(close=result == drivers.MUST_COLLIDE or objects == WITHIN_REACH)
+        try:
+            self._substep_by_substep(
+                close=result == drivers.MUST_COLLIDE or objects == WITHIN_REACH
+            )
+        finally:
+            self.plant.release()
         drivers.transmit(arrays, 0, settings)
         drivers.refer(
             arrays, 0, 0, 1 if settings.external_observer else self.scenario.robot_count, settings
@@ -238,7 +246,12 @@ class Formation:
             self._parts.drive(arrays, substep, settings)
             before = motion.copy() if close else motion
             drivers.actuate(arrays, 0, substep, settings)
-            if close:
+            if isinstance(self.plant, ChipmunkPlant):
+                inputs, contact = arrays.inputs, arrays.rows("contact")
+                torques, floors = inputs[DELIVERED], inputs[FLOOR_INPUT:]
+                self.plant.advance(motion, contact, torques, floors, settings.dt)
+                drivers.account(arrays, 0, settings)
+            elif close:
                 self.plant.collide(before, motion, settings.dt)
             drivers.sense(arrays, 0, substep, settings)
             for robot, body_type in self.plant.hits.items() if close else ():

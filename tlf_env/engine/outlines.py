@@ -7,16 +7,11 @@ import math
 from tlf_env.engine.arrays import Arrays, read_motion
 from tlf_env.engine.layout import in_array
 from tlf_env.numerics.compiled import law
+from tlf_env.physics.reach import CLOSE_MARGIN_MM, FASTEST_CHANGE_MM_S2, compiled_time_for
 from tlf_env.physics.world import gap_to_walls
 from tlf_env.task.info import ROBOT, WALL
 from tlf_env.task.measures import ROUNDING_MM, distance
 
-# Outlines that could come closer than this within a control step are stepped through the space.
-CLOSE_MARGIN_MM = 10.0
-FASTEST_CHANGE_MM_S2 = 1500.0  # above what all three tyres can do at twice the paper's friction
-# With these, steps are counted in which a wall stays out of reach: far above the former, so that a floor
-# that moves under the wheels, or much friction, is included.
-CALM_CHANGE_MM_S2 = 6000.0
 MOST_CALM_STEPS = 1000
 BODY_OUTLINE = in_array("body", "outline_radius")
 BODY_AHEAD = in_array("body", "outline_ahead")
@@ -86,9 +81,8 @@ def away_from_walls(arrays: Arrays, lane: int, duration: float) -> bool:
         speed = outline_speed(arrays, lane, robot)
         if room <= (speed + FASTEST_CHANGE_MM_S2 * duration) * duration:
             return False
-        change = CALM_CHANGE_MM_S2
-        time = (math.sqrt(speed * speed + 2.0 * change * room) - speed) / change
-        calm = min(calm, int(min(time / duration, MOST_CALM_STEPS)))
+        steps = compiled_time_for(speed, room) / duration
+        calm = min(calm, int(min(steps, MOST_CALM_STEPS)))
     arrays.calm[lane] = step + calm
     return True
 

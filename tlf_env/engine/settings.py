@@ -19,6 +19,7 @@ class Settings(NamedTuple):
     """Numbers of a scenario that all robots share."""
 
     kinematic: bool
+    by_chipmunk: bool  # pymunk's bodies and constraints move the robots, not the kernel
     collides: bool  # robots that are near are stepped through a space with contact
     round_outlines: bool  # outlines are circles, so that compiled laws can say which touch
     substeps: int
@@ -56,7 +57,8 @@ def make_settings(scenario: Scenario) -> Settings:
     rays = Rays() if scenario.rays is None else scenario.rays
     return Settings(
         kinematic=scenario.plant == "kinematic",
-        collides=scenario.plant == "pymunk",
+        by_chipmunk=scenario.plant == "chipmunk",
+        collides=scenario.plant in ("pymunk", "chipmunk"),
         round_outlines=all(one.outline_polygon_mm is None for one in scenario.robot_models),
         substeps=scenario.substeps,
         dt=scenario.physics_period_s,

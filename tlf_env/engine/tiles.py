@@ -16,7 +16,13 @@ from __future__ import annotations
 import numpy as np
 
 from tlf_env.disturbances.model import wheel_factors
-from tlf_env.engine.arrays import Arrays, read_command, read_wanted_before
+from tlf_env.engine.arrays import (
+    Arrays,
+    read_command,
+    read_wanted_before,
+    write_floor,
+    write_traction,
+)
 from tlf_env.engine.effects import OF_SUBSTEPS, delays, refresh
 from tlf_env.engine.layout import (
     CONSTANTS_IN_TILE,
@@ -248,6 +254,18 @@ def ask(tile: np.ndarray, substep: int) -> None:
         set_traction(tile, i, undisturbed(commanded_l, commanded_r, effects_of(tile, i)))
 
 
+@block
+def hand_over(inputs: np.ndarray, lanes: int, tile: np.ndarray, count: int) -> None:
+    """Write what a plant in Python needs for the substep."""
+    for i in range(count):
+        column, traction = whole(tile)[COLUMN, i], traction_of(tile, i)
+        robot, lane = column // lanes, column % lanes
+        write_traction(inputs, robot, lane, traction)
+        write_floor(
+            inputs, robot, lane, floor_under(body_of(tile, i), effects_of(tile, i), traction)
+        )
+
+
 @law
 def move(tile: np.ndarray, count: int, dt: float) -> None:
     """The plant: all in closed form, then by sweeps those whose wheels do not all roll."""
@@ -398,7 +416,10 @@ def advance_in(
                         delay_torques(torques, tile, count)
                     if patches.shape[1] > 0:
                         meet_patches(patches, variants, lanes_in_all, tile, count)
-                    move(tile, count, settings.dt)
+                    if settings.by_chipmunk:
+                        hand_over(arrays.inputs, lanes_in_all, tile, count)
+                    else:
+                        move(tile, count, settings.dt)
             if senses:
                 sense_tile(tile, substep, settings.estimator, settings.dt)
                 for f in range(SAMPLE_FIELDS):

@@ -148,8 +148,9 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     def space(self) -> pymunk.Space:
         """The pymunk space, with its bodies at the present poses of the robots; mm, s, kg.
 
-        Shapes, bodies and constraints that you add take part from the next :meth:`step` on, on the plant
-        ``pymunk``. :meth:`reset` keeps them, and puts bodies back to where the first step found them.
+        Shapes, bodies and constraints that you add take part from the next :meth:`step` on, on the plants
+        ``pymunk`` and ``chipmunk``. :meth:`reset` keeps them, and puts bodies back to where the first step
+        found them.
         """
         return self._formation.space
 
@@ -158,6 +159,17 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         """The pymunk body of each robot, for constraints and forces; its origin is the centre of mass."""
         self._formation.space  # noqa: B018 - puts the bodies at their present poses
         return dict(zip(self.possible_agents, self._formation.plant.bodies, strict=True))
+
+    @property
+    def pushable_bodies(self) -> list[pymunk.Body]:
+        """The pymunk bodies of the world's ``pushables``, in their order, where they are now."""
+        return self._formation.plant.pushable_bodies
+
+    @property
+    def moving_bodies(self) -> list[pymunk.Body]:
+        """The pymunk bodies of the world's ``moving`` obstacles, in their order, where they are now."""
+        self._formation.space  # noqa: B018 - puts the bodies where they are now
+        return self._formation.plant.moving_bodies
 
     def observation_space(self, agent: Agent) -> gymnasium.spaces.Box:
         """Space of an agent's observations; the same object at every call."""
@@ -313,6 +325,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     def render(self) -> np.ndarray | None:
         """A frame ``(height, width, 3)`` uint8 in mode ``rgb_array``; None in mode ``human``.
 
+        It shows robots, world and whatever else is in :attr:`space`; drawing changes none of it.
         In mode ``human`` it does nothing: :meth:`reset` and :meth:`step` have drawn the frame.
 
         Raises
@@ -344,6 +357,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                     for patch in map(PatchRow._make, self._patches())
                     if patch.scale != 1  # otherwise the patch has no effect
                 ],
+                courses_mm=[thing.corners_mm() for thing in self.scenario.world.moving],
             )
         return self._renderer.draw(scene_of(self._formation))
 

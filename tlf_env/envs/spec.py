@@ -147,10 +147,10 @@ date) are refused unless they are quoted; a quoted value is a text and never a n
 one of Python or NumPy; `True`, a text or an array is none.
 
 An episode ends for the whole formation at once. `lost`: the true error to the robot's own reference
-exceeded `lost_beyond_mm`. `touched`: two outlines (circles) met. Each of them ends the episode if it is in
-`end_on`: the robots concerned are terminated, the others are truncated with
-`info["end"] == tlf_env.EndReason.OTHER_ROBOT`, so that a learner bootstraps for robots that did not fail. The
-horizon truncates all robots.
+exceeded `lost_beyond_mm`. `touched`: the outline of a robot met that of another, a wall or an obstacle
+([world.md](world.md#touched)). Each of them ends the episode if it is in `end_on`: the robots concerned are
+terminated, the others are truncated with `info["end"] == tlf_env.EndReason.OTHER_ROBOT`, so that a learner
+bootstraps for robots that did not fail. The horizon truncates all robots.
 
 `reset(seed=..., options={"poses": (n, 3) in mm, mm, rad, "phase_s": seconds})` sets the start poses and the
 time on its trajectory at which the leader's reference starts, for that episode only. Heading 0 points along
@@ -159,8 +159,11 @@ state, for critics.
 
 ## Objects in the space
 
-On the plant `pymunk` (the default), `env.space` is a [pymunk](https://www.pymunk.org) space in mm, s and kg
-(forces in mN), and `env.robot_bodies` contains the robots' bodies in it. What you add to it takes part:
+Walls, obstacles, bodies to push and moving obstacles are fields of a scenario: [world.md](world.md). What it
+has no field for is added to the space. On the plants `pymunk` (the default) and `chipmunk`, `env.space` is a
+[pymunk](https://www.pymunk.org) space in mm, s and kg (forces in mN), `env.robot_bodies` contains the robots'
+bodies in it, and `env.pushable_bodies` and `env.moving_bodies` those of the scenario's world. (With
+`gymnasium.make`, `env.unwrapped.formation_env` has them.) What you add takes part from the next step on:
 
 ```python
 import pymunk
@@ -178,14 +181,28 @@ env.space.add(
 )
 ```
 
-- A robot that meets a static or kinematic shape (a wall, a moving obstacle) is `touched`, as by another robot.
-  A dynamic body (a box) can be pushed, and is not counted. The outlines of the robots have no friction.
-- Constraints, such as a rope to a trailer, and forces act on robots, too; the wheels answer one substep later.
-- A dynamic body slides without friction on the floor, unless its `velocity_func` slows it down.
+- A robot that meets a static or kinematic shape (a wall, a moving obstacle) is `touched`, as by another robot,
+  and `touched_by` says which. A dynamic body (a box) can be pushed, and is not counted.
+- A contact has the product of both shapes' `friction` and `elasticity`. Those of the robots are
+  `outline_friction` and `outline_restitution`, 0 by default; those of a new pymunk shape are 0, too.
+- Constraints, such as a [rope to a trailer](../examples/trailer_on_a_rope.py), and
+  [forces](../examples/user_force.py) act on robots; the wheels answer one substep later, on `chipmunk` in the
+  same one. (There `env.robot_bodies` are the chassis alone: [chipmunk.md](chipmunk.md).) A force
+  (`body.apply_force_at_world_point`) acts through the whole next control step and is then 0: apply it before
+  each step. A constraint's `impulse` is that of the last substep: divided by `physics_period_s`, it is the
+  force.
+- A dynamic body that you add slides without friction on the floor. A `PivotJoint` and a `GearJoint` to
+  `space.static_body`, with `max_bias` 0 and a `max_force`, are floor friction; a body in the scenario's
+  `pushables` has both.
+- Robots get their places from the engine: to move a robot, use the option `poses` of `reset`; a position
+  written to its body has no effect.
+- After moving a static shape by hand, call `env.space.reindex_shape(shape)`, and read `env.space` again, so
+  that it is noticed.
 - `reset` keeps the objects, and puts each body back to where the first step found it. Copies and pickles take
-  them along; functions of yours must be picklable for that.
-- A control step takes about twenty times as long while an object is near enough to a robot to act on it, and
-  always with constraints or forces. Objects out of reach change no bit of the robots' motion.
+  them along and go on bit for bit, with constraints too; functions of yours must be picklable for that.
+- While an object is near enough to a robot to act on it, and always with constraints or forces on robots or
+  moving bodies, a control step takes [many times as long](world.md#what-it-costs). Objects out of reach change
+  no bit of the robots' motion.
 
 ## Range sensors
 
@@ -208,7 +225,7 @@ readings_mm = observations["robot_1"][-16:] * env.scenario.rays.range_mm
   `range_mm`.
 - `period_s` is the time between two readings, by default one control period. In between, the last one holds.
 - Walls, static obstacles and round robots are seen on every plant, with the same bits. Everything else needs
-  the plant `pymunk`.
+  the plant `pymunk` or `chipmunk`.
 - Range sensors change no bit of the motion or of the other entries, and policies without rays act as before.
 
 Sixteen rays on each of three robots add 3.5 µs to a control step of 58 µs (7 µs with noise), and in a batch
@@ -218,8 +235,8 @@ obstacles and round robots, a reading takes 0.1 ms more.
 ## Many formations
 
 The following use the batch plant (`tlf_env.BatchPlant`, [architecture.md](architecture.md#many-formations)).
-Robots pass through each other, but `touched` is still reported. All numbers are bit for bit those of
-single environments.
+Robots pass through each other and through walls, but `touched` is still reported. All numbers are bit for bit
+those of single environments.
 
 - `gymnasium.make_vec("tlf_env/Infinity-v0", num_envs=256, vectorization_mode="vector_entry_point",
   learner="robot_1", autoreset_mode="NextStep", threads=1, **fields)`: one learner in each formation; the

@@ -44,21 +44,22 @@ class Mover:
     offset_s: float = 0.0  # drawn for the episode
 
     def at(self, time_s: float) -> tuple[float, float]:
-        """Where the body is at a time, mm."""
+        """Place at a time of the episode, mm."""
         return self.course.at(self.start_s + self.offset_s + time_s)
 
     def place(self, time_s: float, period_s: float) -> None:
         """Put the body where it is at a time, with the velocity that leads to its next place."""
+        now = self.start_s + self.offset_s + time_s
         x, y = self.at(time_s)
-        next_x, next_y = self.course.at(self.start_s + self.offset_s + time_s + period_s)
+        next_x, next_y = self.course.at(now + period_s)
         self.body.position = x, y
         self.body.velocity = (next_x - x) / period_s, (next_y - y) / period_s
 
 
-def build_statics(space: pymunk.Space, world: World) -> list[pymunk.Shape]:
+def build_fixed(space: pymunk.Space, world: World) -> list[pymunk.Shape]:
     """Add walls and obstacles to a space; returns their shapes."""
     shapes: list[pymunk.Shape] = []
-    for thing in world.statics:
+    for thing in world.fixed:
         own: list[pymunk.Shape]
         if isinstance(thing, Wall):
             own = [

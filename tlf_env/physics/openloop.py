@@ -4,16 +4,18 @@ from __future__ import annotations
 
 import itertools
 import math
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any, Self
 
 import numpy as np
 from pydantic import Field, TypeAdapter, ValidationError, model_validator
 
-from tlf_env.common.errors import one_line
+from tlf_env.common.errors import one_line, shown
 from tlf_env.common.files import FILE_NAME, atomic, read_json
 from tlf_env.common.models import Frozen, Number, Switch
 from tlf_env.numerics.compiled import driver
+from tlf_env.physics.chipmunk_plant import ChipmunkPlant
 from tlf_env.physics.kernel import substep
 from tlf_env.physics.parameters import RobotParameters, body_array
 from tlf_env.physics.state import (
@@ -46,6 +48,8 @@ ROW_EVERY_S = 0.1
 MAX_DURATION_S = 1e5
 MAX_TORQUE_NMM = 1e6
 MAX_SUBSTEPS = 100_000_000
+STILL_FLOOR = Floor(0.0, 0.0, 1.0, 1.0, 1.0)
+OPEN_LOOP_PLANTS = ("kernel", "chipmunk")
 # Far beyond any robot, and small enough that squares and products in the plant stay finite.
 MAX_MM = 1e9  # and mm/s
 MAX_RAD = 1e4  # and rad/s
@@ -141,7 +145,7 @@ def advance_open_loop(
     body = read_body(bodies, 0, 0)
     motion = read_motion(motions, 0, 0)
     contact = read_contact(contacts, 0, 0)
-    floor = Floor(0.0, 0.0, 1.0, 1.0, 1.0)
+    floor = STILL_FLOOR
     load = Push(push[0], push[1], push[2])
     for k in range(torques.shape[0]):
         motion, contact = substep(
@@ -150,6 +154,17 @@ def advance_open_loop(
         motion = advance_pose(motion, dt)
     write_motion(motions, 0, 0, motion)
     write_contact(contacts, 0, 0, contact)
+
+
+def advance_chipmunk(
+    plant: ChipmunkPlant, motions: np.ndarray, contacts: np.ndarray, torques: np.ndarray, dt: float
+) -> None:
+    """:func:`advance_open_loop` by a plant of pymunk's constraints, as one control step."""
+    floors = np.array(STILL_FLOOR).reshape(-1, 1, 1)
+    plant.sort(motions)
+    for pair in torques:
+        plant.advance(motions, contacts, pair.reshape(2, 1, 1), floors, dt)
+    plant.release()
 
 
 def _row(t_s: float, motion: Motion, d_mm: float) -> list[float]:
@@ -173,14 +188,22 @@ def run_open_loop(
     scenario: OpenLoopScenario,
     robot: RobotParameters | None = None,
     dt_s: float = 0.001,
+    plant: str | Callable[[RobotParameters], ChipmunkPlant] = "kernel",
 ) -> np.ndarray:
     """Run one scenario; returns rows ``(time, column)`` every 0.1 s, columns as in :data:`COLUMNS`.
+
+    ``plant`` is the exact kernel, or ``"chipmunk"``: pymunk's bodies and constraints; or a function that makes
+    such a plant.
 
     Raises
     ------
     ValueError
-        if ``dt_s`` is not positive, does not divide 0.1 s, or makes too many steps.
+        if ``dt_s`` is not positive, does not divide 0.1 s, or makes too many steps; for an unknown plant.
     """
+    if isinstance(plant, str) and plant not in OPEN_LOOP_PLANTS:
+        raise ValueError(
+            f"plant {shown(plant)} cannot run open loop; there are {', '.join(OPEN_LOOP_PLANTS)}"
+        )
     robot = (robot or RobotParameters()).model_copy(
         update={"joint_friction": scenario.joint_friction}
     )
@@ -203,10 +226,17 @@ def run_open_loop(
     held = np.searchsorted(starts, np.arange(steps), side="right") - 1
     torques = np.where(held[:, None] >= 0, levels[held], 0.0) * MILLINEWTON_PER_NEWTON
     push = np.zeros(3)
+    by_chipmunk = None
+    if plant != "kernel":
+        by_chipmunk = ChipmunkPlant([robot]) if isinstance(plant, str) else plant(robot)
 
     rows = [_row(0.0, Motion(*motions[:, 0, 0].tolist()), robot.com_offset_mm)]
     for first in range(0, steps - steps % per_row, per_row):
-        advance_open_loop(bodies, motions, contacts, torques[first : first + per_row], push, dt_s)
+        some = torques[first : first + per_row]
+        if by_chipmunk is None:
+            advance_open_loop(bodies, motions, contacts, some, push, dt_s)
+        else:
+            advance_chipmunk(by_chipmunk, motions, contacts, some, dt_s)
         t_s = (first + per_row) * dt_s
         rows.append(_row(t_s, Motion(*motions[:, 0, 0].tolist()), robot.com_offset_mm))
     return np.array(rows)

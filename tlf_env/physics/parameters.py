@@ -28,6 +28,9 @@ def convex(points: tuple[tuple[float, float], ...]) -> bool:
     with np.errstate(over="ignore", invalid="ignore"):
         turns = edges[:, 0] * following[:, 1] - edges[:, 1] * following[:, 0]
         angles = np.arctan2(turns, (edges * following).sum(axis=1))
+        longest_2 = (edges**2).sum(axis=1).max()
+    if not np.abs(turns).max() > CONVEX_TOLERANCE * longest_2:
+        return False  # all on a line
     room = CONVEX_TOLERANCE * np.abs(turns).max()
     one_way = bool((turns >= -room).all() or (turns <= room).all())
     once_around = abs(abs(float(angles.sum())) - 2 * math.pi) < 1e-6

@@ -15,17 +15,20 @@ from typing import Any, NamedTuple
 
 import numpy as np
 import pymunk
+from pymunk.batch import BodyFields, Buffer, get_space_bodies
 
 from tlf_env.physics.borders import Borders
 from tlf_env.physics.objects import (
     Mover,
     Pushed,
+    build_fixed,
     build_movers,
     build_pushables,
-    build_statics,
     damped_velocity,
 )
 from tlf_env.physics.parameters import Body, RobotParameters, body_array
+from tlf_env.physics.reach import CLOSE_MARGIN_MM, FASTEST_CHANGE_MM_S2, time_for, way
+from tlf_env.physics.shapes import PlacedShape, Pose, placed_link, placed_shape
 from tlf_env.physics.state import Motion
 from tlf_env.physics.world import Capsule, World
 
@@ -42,11 +45,15 @@ NOTHING, NOBODY = np.zeros((0, len(Capsule._fields))), np.zeros(0, dtype=np.int6
 
 # What the objects in the space do within a control step, walls of the world apart.
 NO_OBJECTS, OUT_OF_REACH, WITHIN_REACH = range(3)
-REACH_MM = 10.0  # objects that could come closer to an outline than this are within reach
-FASTEST_CHANGE_MM_S2 = 1500.0  # of a robot's velocity, as in tlf_env.engine.outlines
-# With these, steps are counted in which objects stay out of reach.
-CALM_CHANGE_MM_S2 = 6000.0
-MOST_CALM_S = 1.0
+MOST_CALM_S = 2.0  # so long objects may be taken to be out of reach without another look
+STIRRED = (
+    BodyFields.POSITION
+    | BodyFields.ANGLE
+    | BodyFields.VELOCITY
+    | BodyFields.ANGULAR_VELOCITY
+    | BodyFields.FORCE
+    | BodyFields.TORQUE
+)
 # A body can pass through a thin one only if it moves farther in a step than half its own thickness.
 LARGEST_MOVE = 0.25  # of that, within a step of the space
 LEAST_HALF_MM = 0.5  # a body that is thinner counts as so thick
@@ -120,7 +127,7 @@ class PymunkPlant:
         self._outlines = [next(iter(body.shapes)) for body in self.bodies]
         self._number = {body: i for i, body in enumerate(self.bodies)}
         world = World() if world is None else world
-        self._walls = set(build_statics(space, world))
+        self._walls = set(build_fixed(space, world))
         self._pushed: list[Pushed] = build_pushables(
             space, world, robots[0].gravity_mm_s2, floor=space.static_body
         )
@@ -130,7 +137,8 @@ class PymunkPlant:
         self._shared = False  # whether a user has had the space
         self._borders: Borders | None = None  # of what rays see in the space, and for which shapes
         self._bordered: tuple[list[pymunk.Shape], list[bool]] = [], []
-        self._own = self._seen = self._counts()
+        self._buffer = Buffer()
+        self._calm: tuple[Any, ...] = ()
         self.reset()
 
     def reset(
@@ -148,14 +156,15 @@ class PymunkPlant:
         space.remove(*shapes)  # with a shape its contacts go
         for body in space.bodies:
             _take_correction(body)
+            body.force, body.torque = (0.0, 0.0), 0.0
         for body, rest in self._rests.items():
-            body.position, body.angle = rest.position, rest.angle
+            body.angle, body.position = rest.angle, rest.position
             body.velocity, body.angular_velocity = rest.velocity, rest.angular_velocity
         for body, outline, polygon, row in zip(
             self.bodies, self._outlines, self._polygons, self._constants.T.tolist(), strict=True
         ):
             robot = Body(*row)
-            body.mass, body.moment = robot.m, robot.I
+            self._weigh(body, robot)
             if isinstance(outline, pymunk.Circle):
                 outline.unsafe_set_radius(robot.outline_radius)
                 outline.unsafe_set_offset((0.0, robot.outline_ahead))
@@ -169,12 +178,27 @@ class PymunkPlant:
         self._forget_constraints()
         self._moved: set[int] = set()
         self._moved_before: set[int] = set()
-        self._corrections: list[Correction] = []
+        self._corrections: list[tuple[pymunk.Body, Correction]] = []
         self._calm_until = 0  # control step before which no object can be within reach
-        self._still: list[tuple[pymunk.Body, tuple[float, float], float]] = []
+        self._pulled: set[int] = set()  # robots with forces, constraints or functions of the user's
+        self._forces: list[tuple[pymunk.Body, tuple[float, float], float]] = []
         self.hits: dict[
             int, int
         ] = {}  # of a substep: robots, and the type of body that each touched
+
+    def _weigh(self, body: pymunk.Body, robot: Body) -> None:
+        """Give a robot's body its mass and inertia."""
+        body.mass, body.moment = robot.m, robot.I
+
+    @property
+    def pushable_bodies(self) -> list[pymunk.Body]:
+        """The bodies of the world's ``pushables``, in their order."""
+        return [one.body for one in self._pushed]
+
+    @property
+    def moving_bodies(self) -> list[pymunk.Body]:
+        """The bodies of the world's ``moving`` obstacles, in their order."""
+        return [mover.body for mover in self._movers]
 
     @property
     def mover_laps_s(self) -> list[float]:
@@ -187,6 +211,41 @@ class PymunkPlant:
         self._calm_until = 0  # whatever is moved now is seen
         self._settle(motions, step)
         return self._space
+
+    def shapes(self, motions: np.ndarray, step: int) -> list[PlacedShape]:
+        """What is in the space beside the robots' outlines, where it is at a control step; only read.
+
+        ``motions`` (field, robot, 1) are the robots', to whose bodies a user may have added shapes.
+        """
+        poses = {
+            body: (motions[X, i, 0], motions[Y, i, 0], motions[THETA, i, 0])
+            for i, body in enumerate(self.bodies)
+        }
+        for mover in self._movers:
+            poses[mover.body] = (*mover.at(step * self._period_s), mover.body.angle)
+
+        def pose(body: pymunk.Body | None) -> Pose:
+            if body is None:
+                return 0.0, 0.0, 0.0
+            return poses.get(body) or (*body.position, body.angle)
+
+        found = [
+            placed_shape(shape, pose(shape.body))
+            for shape in self._space.shapes
+            if shape not in self._outlines
+        ]
+        found += [
+            placed_link(joint, pose(joint.a), pose(joint.b))
+            for joint in self._space.constraints
+            if joint not in self._floor
+        ]
+        return [one for one in found if one is not None]
+
+    def object_poses(self, step: int) -> np.ndarray:
+        """Pose of each pushed body and then of each moving obstacle at a control step, (object, 3); mm, rad."""
+        rows = [(*one.body.position, one.body.angle) for one in self._pushed]
+        rows += [(*one.at(step * self._period_s), one.body.angle) for one in self._movers]
+        return np.array(rows, dtype=np.float64).reshape(-1, 3)
 
     def _settle(self, motions: np.ndarray, step: int) -> None:
         self._write(motions, motions)
@@ -229,9 +288,21 @@ class PymunkPlant:
         ]
         return borders.capsules(poses), np.array(owners, dtype=np.int64)[borders.body_of]
 
-    def _counts(self) -> tuple[int, int, int]:
-        space = self._space
-        return len(space.shapes), len(space.bodies), len(space.constraints)
+    def _stir(self) -> tuple[Any, ...]:
+        """What would differ if a user had added, moved, or pulled at anything but a static shape.
+
+        One call of pymunk for all bodies: this is read in every control step.
+        """
+        space, buffer = self._space, self._buffer
+        buffer.clear()
+        get_space_bodies(space, STIRRED, buffer)
+        return (
+            len(space.shapes),
+            len(space.constraints),
+            bytes(buffer.float_buf()),
+            [body.velocity_func for body in space.bodies],
+            [body.position_func for body in space.bodies],
+        )
 
     def objects(self, motions: np.ndarray, step: int) -> int:
         """What objects could do within a control step: all but the walls of the world.
@@ -241,15 +312,9 @@ class PymunkPlant:
         """
         if not (self._shared or self._pushed or self._movers):
             return NO_OBJECTS
-        space, robots = self._space, self.bodies
-        if self._shared and any(_is_forced(body) for body in robots):
-            return WITHIN_REACH
-        counts = self._counts()
-        if counts == self._own and not self._pushed and not self._movers:
+        if step < self._calm_until and self._stir() == self._calm:
             return NO_OBJECTS
-        if step < self._calm_until and counts == self._seen and self._nothing_stirred():
-            return NO_OBJECTS
-        self._seen = counts
+        space = self._space
         own = {mover.body for mover in self._movers}
         loose = [
             body
@@ -258,6 +323,8 @@ class PymunkPlant:
         ]
         for body in loose:
             self._rests.setdefault(body, _rest(body))
+        if any(_is_forced(body) for body in self.bodies):
+            return WITHIN_REACH
         self._stop_on_floor()
         floor = set(self._floor)
         if any(_is_forced(body, floor) for body in loose):
@@ -278,7 +345,7 @@ class PymunkPlant:
         if moving or (self._movers and loose):
             return OUT_OF_REACH
         self._calm_until = step + int(calm_s / self._period_s)
-        self._still = [(body, body.position, body.angle) for body in loose]
+        self._calm = self._stir()
         return NO_OBJECTS
 
     def _calm_time(self, fastest: float) -> float:
@@ -295,8 +362,8 @@ class PymunkPlant:
             size = math.hypot(box.right - box.left, box.top - box.bottom) / 2
             if isinstance(outline, pymunk.Circle):
                 size = outline.radius
-            room = REACH_MM + (speed + 2.0 * FASTEST_CHANGE_MM_S2 * period_s) * period_s
-            wide = size + REACH_MM + way(speed, MOST_CALM_S)
+            room = CLOSE_MARGIN_MM + (speed + 2.0 * FASTEST_CHANGE_MM_S2 * period_s) * period_s
+            wide = size + CLOSE_MARGIN_MM + way(speed, MOST_CALM_S)
             near = pymunk.BB(centre[0] - wide, centre[1] - wide, centre[0] + wide, centre[1] + wide)
             for shape in space.bb_query(near, pymunk.ShapeFilter()):
                 if shape.body in self._number or shape in self._walls:
@@ -304,19 +371,8 @@ class PymunkPlant:
                 apart = shape.point_query(centre).distance - size
                 if apart <= room:
                     return -1.0
-                calm_s = min(calm_s, time_for(speed, apart - REACH_MM))
+                calm_s = min(calm_s, time_for(speed, apart - CLOSE_MARGIN_MM))
         return calm_s
-
-    def _nothing_stirred(self) -> bool:
-        """Whether all bodies that can be pushed are where they were, at rest and without forces."""
-        floor = self._floor
-        return all(
-            body.position == position
-            and body.angle == angle
-            and _is_still(body)
-            and not _is_forced(body, floor)
-            for body, position, angle in self._still
-        )
 
     def _stop_on_floor(self) -> None:
         """Stop pushed bodies that rounding keeps in motion."""
@@ -329,6 +385,7 @@ class PymunkPlant:
         """Run so many substeps of the space while the robots stand where they are."""
         self._write(motions, np.zeros_like(motions))
         self._place_movers(step)
+        self._hold_forces()
         self._forget_constraints()
         for _ in range(substeps):
             self._step_space(dt)
@@ -340,12 +397,15 @@ class PymunkPlant:
             if body.shapes and not _is_still(body):
                 farthest = max(farthest, _fastest_point(body) * dt / half_thickness(body))
         parts = min(max(1, math.ceil(farthest / LARGEST_MOVE)), MOST_SPLITS)
-        if self._corrections:
-            self._step_after_a_copy(dt / parts)
-        else:
-            self._space.step(dt / parts)
-        for _ in range(parts - 1):
-            self._space.step(dt / parts)
+        for _ in range(parts):
+            for body, force, torque in self._forces:
+                body.force, body.torque = force, torque
+            if self._corrections:
+                self._step_after_a_copy(dt / parts)
+            else:
+                self._space.step(dt / parts)
+            for i, body in enumerate(self.bodies):
+                body.each_arbiter(self._remember, i)
 
     def _write(self, poses: np.ndarray, velocities: np.ndarray) -> None:
         for i, body in enumerate(self.bodies):
@@ -354,7 +414,7 @@ class PymunkPlant:
             body.velocity = velocities[V_X, i, 0], velocities[V_Y, i, 0]
             body.angular_velocity = velocities[YAW, i, 0]
 
-    def sort(self, motions: np.ndarray, step: int) -> None:
+    def sort(self, motions: np.ndarray, step: int = 0) -> None:
         """Make the space's index of outlines anew, robot by robot; to be called before a control step.
 
         The order in which Chipmunk solves contacts comes from that index, which otherwise depends on all
@@ -362,6 +422,7 @@ class PymunkPlant:
         type leaves the index and enters it again, and keeps its contacts. Two robots have only one.
         """
         self._place_movers(step)
+        self._hold_forces()
         self._forget_constraints()
         if len(self.bodies) <= 2 and len(self._space.shapes) == len(self.bodies):
             return
@@ -373,7 +434,16 @@ class PymunkPlant:
             for outline in body.shapes:
                 outline.cache_bb()
             body.body_type = pymunk.Body.DYNAMIC
-            body.mass, body.moment = robot.m, robot.I
+            self._weigh(body, robot)
+
+    def _hold_forces(self) -> None:
+        """Remember the forces on bodies, which Chipmunk forgets after a step, for the whole control step."""
+        self._forces = [
+            (body, body.force, body.torque)
+            for body in self._space.bodies
+            if body.force != (0.0, 0.0) or body.torque
+        ]
+        self._pulled = {i for i, body in enumerate(self.bodies) if _is_forced(body)}
 
     def _forget_constraints(self) -> None:
         """Set the impulses that constraints remember to 0; to be called before a control step.
@@ -411,18 +481,22 @@ class PymunkPlant:
         """
         self._write(before, motions)
         self._moved_before, self._moved = self._moved, set()
-        self._step_space(dt)
-        self.hits = {}
-        for i, body in enumerate(self.bodies):
-            body.each_arbiter(self._remember, i)
-            if body.constraints or _is_forced(body):
-                self._moved.add(i)
+        self._run(dt)
+        self._moved |= self._pulled
         for i in self._moved | self._moved_before:
             body = self.bodies[i]
             motions[X, i, 0], motions[Y, i, 0] = body.position
             motions[THETA, i, 0] = body.angle
             motions[V_X, i, 0], motions[V_Y, i, 0] = body.velocity
             motions[YAW, i, 0] = body.angular_velocity
+
+    def release(self) -> None:
+        """Called after a control step that ran substep by substep."""
+
+    def _run(self, dt: float) -> None:
+        """A substep of the space, and which robots a contact has moved in it."""
+        self.hits = {}
+        self._step_space(dt)
 
     def _remember(self, arbiter: pymunk.Arbiter, robot: int) -> None:
         self._moved.add(robot)
@@ -444,7 +518,7 @@ class PymunkPlant:
 
         corrected = [
             (body, correction)
-            for body, correction in zip(self._space.bodies, self._corrections, strict=True)
+            for body, correction in self._corrections
             if body.position_func is pymunk.Body.update_position
         ]
         for body, correction in corrected:
@@ -458,19 +532,17 @@ class PymunkPlant:
     def __getstate__(self) -> dict[str, Any]:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
         if not self._corrections:
-            self._corrections = [_take_correction(body) for body in self._space.bodies]
-        return {**self.__dict__, "_borders": None, "_bordered": ([], [])}
+            self._corrections = [(body, _take_correction(body)) for body in self._space.bodies]
+        return {
+            **self.__dict__,
+            "_buffer": None,
+            "_calm": (),
+            "_borders": None,
+            "_bordered": ([], []),
+        }
 
-
-def way(speed: float, time_s: float) -> float:
-    """How far something may come in a time, mm, that may change its speed by ``CALM_CHANGE_MM_S2``."""
-    return (speed + CALM_CHANGE_MM_S2 / 2.0 * time_s) * time_s
-
-
-def time_for(speed: float, way_mm: float) -> float:
-    """In what time :func:`way` is so long, s."""
-    change = CALM_CHANGE_MM_S2
-    return (math.sqrt(speed * speed + 2.0 * change * max(way_mm, 0.0)) - speed) / change
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        self.__dict__.update(state, _buffer=Buffer())
 
 
 def half_thickness(body: pymunk.Body) -> float:
@@ -536,6 +608,8 @@ def _take_correction(body: pymunk.Body) -> Correction:
 
     pymunk has no property for it. But a body at rest at the origin goes just that far in one second.
     """
+    centre = body.center_of_gravity
+    _move_origin(body, (0.0, 0.0))
     pose, twist = (body.position, body.angle), (body.velocity, body.angular_velocity)
     body.position, body.angle, body.velocity, body.angular_velocity = (
         (0.0, 0.0),
@@ -547,7 +621,14 @@ def _take_correction(body: pymunk.Body) -> Correction:
     correction = Correction(*body.position, body.angle)
     body.position, body.angle = pose
     body.velocity, body.angular_velocity = twist
+    _move_origin(body, centre)
     return correction
+
+
+def _move_origin(body: pymunk.Body, centre: tuple[float, float]) -> None:
+    """Move a body's origin so that its centre of mass, which stays where it is, is at ``centre``."""
+    body.center_of_gravity = centre
+    body.angle = body.angle  # only now does the position follow
 
 
 def _advance_corrected(correction: Correction, body: pymunk.Body, dt: float) -> None:

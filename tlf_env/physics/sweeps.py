@@ -8,6 +8,7 @@ body; across (⊥, x) and along (∥, y) the castor's fork.
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 from tlf_env.numerics.compiled import block, law
 from tlf_env.physics.friction import disc
@@ -163,6 +164,29 @@ def share_lateral(
     return total - right, right
 
 
+class Slips(NamedTuple):
+    """Slip velocities of the tyres over the floor, mm/s."""
+
+    e: float  # both drive wheels, to the right
+    lf: float  # left, forward
+    rf: float
+    cx: float  # castor, ⊥ to the fork
+    cy: float  # castor, ∥ to the fork
+
+
+@law
+def tyre_slips(body: Body, rates: Rates, floor: Floor, cos_p: float, sin_p: float) -> Slips:
+    """Slip velocities that belong to some rates, at the castor angle with this cosine and sine."""
+    castor_e = rates.v_e + rates.w * body.q
+    return Slips(
+        e=rates.v_e - rates.w * body.d,
+        lf=rates.v_f - rates.w * body.h - body.R * rates.omega_l - floor.conveyor_l,
+        rf=rates.v_f + rates.w * body.h - body.R * rates.omega_r - floor.conveyor_r,
+        cx=castor_e * cos_p + rates.v_f * sin_p + body.T * rates.s,
+        cy=-castor_e * sin_p + rates.v_f * cos_p - body.R_c * rates.omega_c,
+    )
+
+
 @block
 def sweep(
     body: Body,
@@ -244,14 +268,10 @@ def sweep(
     if lam_l == 0.0 and lam_r == 0.0:
         p_le, p_re = share_lateral(p_le, p_lf, p_re, p_rf, limits.grip_l, limits.grip_r)
 
-    side_slip = v_e - w * body.d
-    slip_lf = v_f - w * body.h - body.R * omega_l - floor.conveyor_l
-    slip_rf = v_f + w * body.h - body.R * omega_r - floor.conveyor_r
-    castor_e = v_e + w * body.q
-    slip_cx = castor_e * cos_p + v_f * sin_p + body.T * s
-    slip_cy = -castor_e * sin_p + v_f * cos_p - body.R_c * omega_c
+    after = Rates(v_e=v_e, v_f=v_f, w=w, s=s, omega_l=omega_l, omega_r=omega_r, omega_c=omega_c)
+    slips = tyre_slips(body, after, floor, cos_p, sin_p)
     return (
-        Rates(v_e=v_e, v_f=v_f, w=w, s=s, omega_l=omega_l, omega_r=omega_r, omega_c=omega_c),
+        after,
         Contact(
             p_le=p_le,
             p_lf=p_lf,
@@ -263,8 +283,8 @@ def sweep(
             q_r=q_r,
             q_c=q_c,
             q_s=q_s,
-            slip_l=math.sqrt(side_slip * side_slip + slip_lf * slip_lf),
-            slip_r=math.sqrt(side_slip * side_slip + slip_rf * slip_rf),
-            slip_c=math.sqrt(slip_cx * slip_cx + slip_cy * slip_cy),
+            slip_l=math.sqrt(slips.e * slips.e + slips.lf * slips.lf),
+            slip_r=math.sqrt(slips.e * slips.e + slips.rf * slips.rf),
+            slip_c=math.sqrt(slips.cx * slips.cx + slips.cy * slips.cy),
         ),
     )

@@ -24,8 +24,8 @@ payload                :class:`Mass`, the constants that a payload changes, by :
 Four more places outside this package depend on the wheels and have to be adapted:
 :func:`tlf_env.disturbances.model.wheel_factors` (wheels on friction patches), the inverse dynamics of
 :mod:`tlf_env.task.feasibility`, the castor's entry in :class:`tlf_env.task.info.State`, and
-:mod:`tlf_env.rendering`. Inside it, :mod:`~tlf_env.physics.linear` and :mod:`~tlf_env.physics.openloop`
-do.
+:mod:`tlf_env.rendering`. Inside it, :mod:`~tlf_env.physics.linear`, :mod:`~tlf_env.physics.openloop` and
+:mod:`~tlf_env.physics.chipmunk_plant` do.
 """
 
 from tlf_env.physics.kernel import roll, slide, substep

@@ -16,9 +16,16 @@ from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch
 from tlf_env.numerics.compiled import law
 from tlf_env.physics.parameters import convex
 
-Share = Annotated[Number, Field(ge=0, le=1)]
-Point = tuple[Number, Number]
 MAX_PIECES = 1000  # of a world
+FARTHEST_MM = 1e10  # of a coordinate, as of trajectories
+FASTEST_MM_S = 1e5
+Share = Annotated[Number, Field(ge=0, le=1)]
+Place = Annotated[Number, Field(ge=-FARTHEST_MM, le=FARTHEST_MM)]
+Length = Annotated[Positive, Field(le=FARTHEST_MM)]
+Duration = Annotated[NonNegative, Field(le=1e9)]
+Mass = Annotated[Positive, Field(ge=1e-6, le=1e6)]
+Inertia = Annotated[Positive, Field(ge=1e-6, le=1e15)]
+Point = tuple[Place, Place]
 
 
 class Surface(Frozen):
@@ -35,15 +42,15 @@ class CircleShape(Frozen):
     """A disc."""
 
     type: Literal["circle"]
-    radius_mm: Positive
+    radius_mm: Length
 
 
 class BoxShape(Frozen):
     """A rectangle around its place, ``width_mm`` along x and ``length_mm`` along y at angle 0."""
 
     type: Literal["box"]
-    width_mm: Positive
-    length_mm: Positive
+    width_mm: Length
+    length_mm: Length
 
 
 class PolygonShape(Frozen):
@@ -68,36 +75,55 @@ class Wall(Surface):
     """A wall along a polyline, ``thickness_mm`` thick with round ends; 0 is a line."""
 
     points_mm: Annotated[tuple[Point, ...], Field(min_length=2, max_length=MAX_PIECES)]
-    thickness_mm: NonNegative = 20.0
+    thickness_mm: Annotated[NonNegative, Field(le=FARTHEST_MM)] = 20.0
     closed: Switch = False  # whether the last point is joined to the first
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        _check_apart(self.points_mm)
+        return self
+
+
+def _check_apart(points_mm: tuple[Point, ...]) -> None:
+    if len(set(points_mm)) == 1:
+        raise ValueError(f"points_mm {points_mm} must not all be the same point")
 
 
 class Obstacle(Surface):
     """A shape that stands fast."""
 
     shape: Shape
-    x_mm: Number
-    y_mm: Number
+    x_mm: Place
+    y_mm: Place
     angle_rad: Number = 0.0
 
 
 class Pushable(Surface):
     """A body that can be pushed. On the floor it rubs by Coulomb's law, as a whole and in turning.
 
+    Its place is its centre of mass, which a polygon must contain.
     Floor friction transmits at most ``floor_friction``·mass·g through the centre, and that times the mean
     distance of the shape's area from the centre in turning. ``damping_per_s`` is the rate at which
     velocities decrease besides.
     """
 
     shape: Shape
-    x_mm: Number
-    y_mm: Number
+    x_mm: Place
+    y_mm: Place
     angle_rad: Number = 0.0
-    mass_kg: Positive
-    inertia_kg_mm2: Positive | None = None  # about the centre; None: that of a uniform plate
+    mass_kg: Mass
+    inertia_kg_mm2: Inertia | None = None  # about the centre; None: that of a uniform plate
     restitution: Share = 0.0
     floor_friction: NonNegative = 0.3
     damping_per_s: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if isinstance(self.shape, PolygonShape) and not contains_origin(self.shape.points_mm):
+            raise ValueError(
+                f"shape.points_mm {self.shape.points_mm} must contain (0, 0), the centre of mass"
+            )
+        return self
 
 
 class MovingObstacle(Surface):
@@ -110,10 +136,10 @@ class MovingObstacle(Surface):
 
     shape: Shape
     points_mm: Annotated[tuple[Point, ...], Field(min_length=2, max_length=MAX_PIECES)]
-    speed_mm_s: Positive
+    speed_mm_s: Annotated[Positive, Field(le=FASTEST_MM_S)]
     closed: Switch = False
-    pause_s: NonNegative = 0.0
-    start_s: NonNegative = 0.0
+    pause_s: Duration = 0.0
+    start_s: Duration = 0.0
     random_start: Switch = False
     angle_rad: Number = 0.0
 
@@ -121,24 +147,24 @@ class MovingObstacle(Surface):
     def _check(self) -> Self:
         if self.closed and self.pause_s:
             raise ValueError(f"pause_s {self.pause_s} needs a path with ends; closed must be false")
-        if not 0 < self.lap_s < math.inf:
-            raise ValueError(f"points_mm {self.points_mm} must not all be the same point")
+        _check_apart(self.points_mm)
         return self
 
     @property
     def lap_s(self) -> float:
         """Time after which the course repeats."""
-        length = float(np.hypot(*np.diff(self._corners(), axis=0).T).sum())
+        length = float(np.hypot(*np.diff(self.corners_mm(), axis=0).T).sum())
         once = length / self.speed_mm_s
         return once if self.closed else 2.0 * (once + self.pause_s)
 
-    def _corners(self) -> np.ndarray:
+    def corners_mm(self) -> np.ndarray:
+        """Corners of the path, ``(corner, 2)``; of a closed one the first again at the end."""
         points = np.array(self.points_mm, dtype=np.float64)
         return np.concatenate([points, points[:1]]) if self.closed else points
 
     def course(self) -> Course:
         """The corners over the time of one lap."""
-        corners = self._corners()
+        corners = self.corners_mm()
         ways = np.concatenate([[0.0], np.hypot(*np.diff(corners, axis=0).T).cumsum()])
         times = ways / self.speed_mm_s
         if not self.closed:
@@ -168,9 +194,9 @@ class Course(NamedTuple):
 class Patch(Frozen):
     """A disc on the floor where the tyres' friction is scaled."""
 
-    x_mm: Number
-    y_mm: Number
-    radius_mm: Positive
+    x_mm: Place
+    y_mm: Place
+    radius_mm: Length
     friction_scale: NonNegative
 
 
@@ -184,7 +210,7 @@ class World(Frozen):
     patches: Annotated[tuple[Patch, ...], Field(max_length=MAX_PIECES)] = ()
 
     @property
-    def statics(self) -> tuple[Wall | Obstacle, ...]:
+    def fixed(self) -> tuple[Wall | Obstacle, ...]:
         """Everything that stands fast."""
         return (*self.walls, *self.obstacles)
 
@@ -241,7 +267,7 @@ def capsules_of(thing: Wall | Obstacle) -> list[Capsule]:
 
 def capsule_rows(world: World) -> np.ndarray:
     """The static world, ``(capsule, Capsule)``."""
-    found = [one for thing in world.statics for one in capsules_of(thing)]
+    found = [one for thing in world.fixed for one in capsules_of(thing)]
     return np.array(found, dtype=np.float64).reshape(-1, len(Capsule._fields))
 
 
@@ -279,6 +305,14 @@ def gap_to_walls(capsules: np.ndarray, x: float, y: float) -> float:
     for number in range(capsules.shape[0]):
         nearest = min(nearest, gap_to_capsule(capsules, number, x, y))
     return nearest
+
+
+def contains_origin(points_mm: tuple[Point, ...]) -> bool:
+    """Whether (0, 0) lies in a convex polygon, its border excluded."""
+    corners = np.array(points_mm, dtype=np.float64)
+    after = np.roll(corners, -1, axis=0)
+    sides = corners[:, 0] * after[:, 1] - corners[:, 1] * after[:, 0]
+    return bool((sides > 0).all() or (sides < 0).all())
 
 
 def mean_distance(shape: Any) -> float:

@@ -13,6 +13,7 @@ from tlf_env.rendering.looks import Colour
 FLOOR: Colour = (252, 252, 250)
 INK: Colour = (60, 62, 66)
 SOFT_PX = 0.7  # width of an antialiased edge
+SMOOTH_TURN = 0.9  # cosine of a turn between two lines up to which their ends need no rounding
 BLOCK = 6  # segments of a line with the same colour
 CIRCLE = np.stack([f(np.linspace(0, 2 * np.pi, 37)) for f in (np.cos, np.sin)], axis=-1)
 
@@ -111,6 +112,19 @@ class Shapes:
         self.bar(place, (2 * arm, width), colour)
         self.bar(place, (width, 2 * arm), colour)
 
+    def stroke(self, points: Sequence[tuple[float, float]], width: float, colour: Colour) -> None:
+        """The line around a polygon, or between two points, with round corners."""
+        last = points[-1]
+        heading = math.atan2(last[0] - points[-2][0], last[1] - points[-2][1])
+        for x, y in points:
+            before, heading = heading, math.atan2(x - last[0], y - last[1])
+            middle = Place((x + last[0]) / 2, (y + last[1]) / 2, heading, 1.0)
+            length = math.hypot(x - last[0], y - last[1]) + 2 * SOFT_PX
+            self.bar(middle, (width, length), colour)
+            if math.cos(heading - before) < SMOOTH_TURN:
+                self.disc(Place(*last, 0.0, 1.0), width / 2, colour)
+            last = (x, y)
+
     def disc(self, place: Place, radius: float, colour: Colour) -> None:
         """A filled circle."""
         points = (radius - SOFT_PX) * CIRCLE + (place.x, place.y)
@@ -150,6 +164,25 @@ class Shapes:
             self.fill(outline, colour)
             self._pg.draw.aalines(self._canvas, colour, False, outline[:half])
             self._pg.draw.aalines(self._canvas, colour, False, outline[half:])
+
+
+def clipped(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """The part of a convex polygon ``(corner, 2)`` in a rectangle, given by two corners."""
+    for axis, bound, sign in ((0, low, 1.0), (1, low, 1.0), (0, high, -1.0), (1, high, -1.0)):
+        if not len(points):
+            break
+        depth = sign * (points[:, axis] - bound[axis])
+        if (depth >= 0).all():
+            continue
+        ends, ends_depth = np.roll(points, -1, axis=0), np.roll(depth, -1)
+        kept = []
+        for point, end, here, there in zip(points, ends, depth, ends_depth, strict=True):
+            if here >= 0:
+                kept.append(point)
+            if (here >= 0) != (there >= 0):
+                kept.append(point + here / (here - there) * (end - point))
+        points = np.array(kept).reshape(-1, 2)
+    return points
 
 
 def mixed(of: Colour, with_: Colour, part: float) -> Colour:

@@ -12,17 +12,30 @@ from typing import Any
 
 import numpy as np
 
+from tlf_env.physics.shapes import Kind, PlacedShape
 from tlf_env.physics.vehicle import RobotParameters
-from tlf_env.rendering.drawing import BLOCK, FLOOR, INK, Place, Shapes, View, mixed
+from tlf_env.rendering.drawing import BLOCK, FLOOR, INK, Place, Shapes, View, clipped, mixed
 from tlf_env.rendering.looks import (
     CASTOR_WIDTH_MM,
+    COURSE,
+    CRATE,
+    CRATE_EDGE,
     DRIVE_WHEEL_WIDTH_MM,
+    GRIPPY,
+    MOVER,
+    MOVER_EDGE,
     NOSE,
     RENDER_MODES,
+    SLIPPERY,
+    WALL,
+    WALL_EDGE,
     Colour,
+    front_mm,
+    outline_mm,
     robot_colours,
 )
 from tlf_env.rendering.scene import Scene
+from tlf_env.task.metrics import touched_name
 
 OVERSAMPLING = 2
 DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and scale with it
@@ -34,8 +47,16 @@ PATH: Colour = (188, 190, 193)
 TYRE: Colour = (48, 50, 54)
 TREAD: Colour = (205, 208, 212)
 ALARM: Colour = (236, 0, 84)  # slip, lost, touched; no robot has this colour
-SLIPPERY: Colour = (214, 233, 246)
-GRIPPY: Colour = (247, 232, 210)
+
+EDGE_LINE_PX = 1.2  # of what stands fast
+# Inside and edge of what else is in the space, and the width of the edge; None: the floor shows.
+THINGS: dict[Kind, tuple[Colour | None, Colour, float]] = {
+    "loose": (CRATE, CRATE_EDGE, 1.3),
+    "moving": (MOVER, MOVER_EDGE, 2.2),
+    "zone": (None, WALL_EDGE, 1.3),
+    "link": (None, INK, 1.3),
+}
+DASH_PX, COURSE_PX, MOST_DASHES = 7.0, 1.5, 1000
 
 AXLE_MM = 8.0  # in pictures only
 TREADS, TREAD_RADII = 4, 0.2  # more would seem to turn backwards at top speed and 20 frames/s
@@ -44,7 +65,11 @@ SLIP_SHOWN_MM_S, SLIP_FULL_MM_S = 2.0, 60.0
 
 ARM_RADII = 0.25  # arms of the reference's cross
 MARGIN_RADII = 3.0  # room around the path, in outline radii
-MOST_START_MM = 1500.0  # largest extension of the view towards robots that start off the path
+MOST_START_MM = (
+    1500.0  # largest extension of the view towards robots that start off the path, and the world
+)
+WORLD_RADII = 0.6  # room around the world
+FOOT_PX = 36  # room below it, for the scale bar
 TRAIL_POINTS = 96  # of one trail
 PATH_POINTS = 1000
 TRAIL_PX, PATH_PX = 5.0, 2.0
@@ -66,8 +91,8 @@ class Renderer:
     robots
         Parameters of each robot.
     path_mm
-        The leader's whole reference, ``(k, 2)``. The view contains it and the robots' start, and does not
-        move; a robot outside is shown as an arrow at the edge.
+        The leader's whole reference, ``(k, 2)``. The view contains it, the robots' start and the world
+        nearby, and does not move in an episode; a robot outside is shown as an arrow at the edge.
     mode
         ``"rgb_array"``: frames as arrays, without a display. ``"human"``: a window with at most ``fps``
         frames per second.
@@ -79,6 +104,8 @@ class Renderer:
         Duration of the robots' trails.
     patches
         Round patches of different friction: mappings of ``x_mm``, ``y_mm``, ``radius_mm`` and ``scale``.
+    courses_mm
+        Paths of moving obstacles, each ``(k, 2)``.
     close_up
         Number of the robot in the close-up in a corner, at most that of the last robot; None: no close-up.
 
@@ -100,6 +127,7 @@ class Renderer:
         size_px: tuple[int, int] = DESIGN_SIZE_PX,
         trail_s: float = 20.0,
         patches: Sequence[Mapping[str, float]] = (),
+        courses_mm: Sequence[np.ndarray] = (),
         close_up: int | None = 1,
     ) -> None:
         if mode not in RENDER_MODES:
@@ -114,6 +142,8 @@ class Renderer:
             for part in np.linspace(0.15, 0.85, 32).tolist()
         ]
         self._patches = list(patches)
+        self._courses_mm = list(courses_mm)
+        self._outlines_mm = [outline_mm(robot) for robot in robots]
         self._fps, self._trail_s = fps, trail_s
         self._close_up = None if close_up is None else min(close_up, len(robots) - 1)
         self.begin(path_mm)
@@ -133,6 +163,8 @@ class Renderer:
         stride = max(1, len(path_mm) // PATH_POINTS)
         self._path_mm = np.concatenate([path_mm[::stride], path_mm[-1:]])
         self._trail: list[tuple[float, np.ndarray]] = []  # time, (robot, 2)
+        self._fixed: tuple[PlacedShape, ...] = ()  # what the background shows
+        self._fitted: View | None = None
         self._background: Any = None
 
     def draw(self, scene: Scene) -> np.ndarray | None:
@@ -148,6 +180,7 @@ class Renderer:
         self._remember(scene)
         self._background = self._background or self._draw_background()
         self._canvas.blit(self._background, (0, 0))
+        self._draw_objects(self._view, scene)
         self._draw_robots(self._view, scene)
         self._draw_arrows(scene)
         self._draw_close_up(scene)
@@ -180,7 +213,7 @@ class Renderer:
             for size in (TEXT_PX, TIME_PX, TEXT_PX * OVERSAMPLING)
         )
         self._shapes = Shapes(pg, self._canvas, canvas_font)
-        self._background = None
+        self._fitted = self._background = None
 
     def _pixels(self) -> np.ndarray:
         width, height = self._size_px
@@ -216,7 +249,11 @@ class Renderer:
         places = np.stack([scene.x_mm, scene.y_mm], axis=-1)
         if not self._trail or scene.t_s < self._trail[-1][0]:
             self._trail.clear()
-            self._start_mm, self._background = places, None
+            self._start_mm, self._fitted = places, None
+            self._world_mm = self._places_of(scene.objects)
+        fixed = tuple(one for one in scene.objects if one.kind == "fixed")
+        if self._fitted is None or fixed != self._fixed:
+            self._fixed, self._background = fixed, None
         spacing_s = self._trail_s / TRAIL_POINTS
         if len(self._trail) > 1 and self._trail[-1][0] - self._trail[-2][0] < spacing_s:
             self._trail.pop()
@@ -224,16 +261,34 @@ class Renderer:
         while self._trail[0][0] < scene.t_s - self._trail_s:
             self._trail.pop(0)
 
+    def _places_of(self, objects: Sequence[PlacedShape]) -> list[np.ndarray]:
+        """Where things are, or will go on their courses; each ``(point, 2)``, mm."""
+        places = [one.border_mm() for one in objects]
+        moving = [one for one in objects if one.kind == "moving"]
+        reach_mm = max((np.ptp(one.border_mm(), axis=0).max() / 2 for one in moving), default=0.0)
+        around_mm = reach_mm * np.array([(-1, -1), (1, 1)])
+        places += [
+            (course_mm[:, None] + around_mm).reshape(-1, 2) for course_mm in self._courses_mm
+        ]
+        return places
+
     # Floor
 
     def _fit(self) -> View:
-        """The view of path and start: centred, or farther right beside the text."""
-        room = MARGIN_RADII * max(robot.outline_radius_mm for robot in self._robots)
+        """The view of path, start and world: centred, or farther right beside the text."""
+        radius = max(robot.outline_radius_mm for robot in self._robots)
+        room, world_room = MARGIN_RADII * radius, WORLD_RADII * radius
         low, high = self._path_mm.min(axis=0), self._path_mm.max(axis=0)
         start = self._start_mm[np.isfinite(self._start_mm).all(axis=-1)]
-        start = np.clip(start, low - MOST_START_MM, high + MOST_START_MM)
-        shown = np.concatenate([self._path_mm, start])
+        farthest = low - MOST_START_MM, high + MOST_START_MM
+        shown = np.concatenate([self._path_mm, np.clip(start, *farthest)])
         low, high = shown.min(axis=0) - room, shown.max(axis=0) + room
+        if self._world_mm:
+            world = np.clip(np.concatenate(self._world_mm), *farthest)
+            low = np.minimum(low, world.min(axis=0) - world_room)
+            high = np.maximum(high, world.max(axis=0) + world_room)
+            foot = OVERSAMPLING * self._unit * FOOT_PX / self._canvas.get_height()
+            low[1] = min(low[1], world[:, 1].min() - foot * (high[1] - low[1]))
         width, height = self._canvas.get_size()
         scale = min(width / (high[0] - low[0]), height / (high[1] - low[1]))
         pen = OVERSAMPLING * self._unit
@@ -251,7 +306,7 @@ class Renderer:
         )
 
     def _draw_background(self) -> Any:
-        self._view = self._fit()
+        self._view = self._fitted = self._fitted or self._fit()
         step_mm = round_length(GRID_PX * self._view.pen / self._view.scale)
         self._draw_floor(self._view, step_mm)
         self._draw_scale_bar(self._view, step_mm)
@@ -269,6 +324,11 @@ class Renderer:
                 self._canvas.fill(colour, (x, view.top, OVERSAMPLING, view.height))
             for y in rows:
                 self._canvas.fill(colour, (view.left, y, view.width, OVERSAMPLING))
+        for inside in (False, True):  # all edges first, so that none crosses the pieces of a wall
+            for thing in self._fixed:
+                self._draw_fixed(view, thing, inside)
+        for course_mm in self._courses_mm:
+            self._draw_course(view, course_mm)
         width = np.full(len(self._path_mm), PATH_PX * view.pen)
         self._shapes.lines(view, self._path_mm[:, None], width, [[PATH]] * len(width))
 
@@ -278,6 +338,59 @@ class Renderer:
         self._shapes.disc(centre, patch["radius_mm"] * view.scale, colour)
         if view is self._view:
             self._shapes.label(f"µ × {patch['scale']:g}", colour, center=(centre.x, centre.y))
+
+    def _draw_course(self, view: View, course_mm: np.ndarray) -> None:
+        """The path of a moving obstacle, dashed."""
+        ways = np.concatenate([[0.0], np.hypot(*np.diff(course_mm, axis=0).T).cumsum()])
+        dash_mm = DASH_PX * self._view.pen / self._view.scale
+        dashes = min(max(round(ways[-1] / dash_mm / 2), 1), MOST_DASHES)
+        starts = np.linspace(0.0, ways[-1], dashes, endpoint=False)
+        ends = np.stack([starts, starts + ways[-1] / dashes / 2], axis=-1)
+        places = np.stack([np.interp(ends, ways, axis) for axis in course_mm.T], axis=-1)
+        px = view.px(places)
+        for dash in px[view.shows(px, 50.0 * view.pen).all(axis=-1)].tolist():
+            self._shapes.stroke(dash, COURSE_PX * view.pen, COURSE)
+
+    def _border_px(self, view: View, thing: PlacedShape, room: float) -> np.ndarray:
+        """The border of a shape in the space, on the canvas, cut ``room`` outside the window."""
+        low = np.array([view.left - room, view.top - room])
+        high = low + np.array([view.width, view.height]) + 2.0 * room
+        corners, radius = view.px(np.array(thing.corners_mm)) - 0.5, thing.radius_mm * view.scale
+        if (corners.max(axis=0) + radius < low).any() or (
+            corners.min(axis=0) - radius > high
+        ).any():
+            return np.zeros((0, 2))
+        return clipped(view.px(thing.border_mm()) - 0.5, low, high)
+
+    def _draw_fixed(self, view: View, thing: PlacedShape, inside: bool) -> None:
+        """The inside of what stands fast, or the line around it."""
+        width = 2.0 * EDGE_LINE_PX * view.pen
+        points = self._border_px(view, thing, 2.0 * width).tolist()
+        if inside and len(points) > 2:
+            self._shapes.fill(points, WALL)
+        elif points and not inside:
+            self._shapes.stroke(points, width, WALL_EDGE)
+
+    def _draw_thing(self, view: View, thing: PlacedShape) -> None:
+        """What does not stand fast; what can be pushed has its diagonals marked if it has four corners."""
+        fill, edge, line = THINGS[thing.kind]
+        width = line * view.pen
+        points = self._border_px(view, thing, 4.0 * width).tolist()
+        if not points:
+            return
+        if fill is not None and len(points) > 2:
+            self._shapes.fill(points, fill)
+        corners = view.px(np.array(thing.corners_mm)) - 0.5
+        if thing.kind == "loose" and len(corners) == len(points) == 4:
+            for ends in (corners[::2], corners[1::2]):
+                self._shapes.stroke(ends.tolist(), 0.8 * width, mixed(CRATE, edge, 0.5))
+        self._shapes.stroke(points, width, edge)
+
+    def _draw_objects(self, view: View, scene: Scene) -> None:
+        """Everything in the space that the background does not show."""
+        for thing in scene.objects:
+            if thing.kind != "fixed":
+                self._draw_thing(view, thing)
 
     def _draw_scale_bar(self, view: View, length_mm: float) -> None:
         pen, length = self._view.pen, length_mm * view.scale
@@ -323,12 +436,18 @@ class Renderer:
         robot, colour, pen = self._robots[number], self._colours[number], view.pen
         centre, half = body.at(0, -robot.outline_offset_mm), robot.axle_width_mm / 2
         radius = view.scale * robot.outline_radius_mm
-        self._shapes.disc(centre, radius + 0.6 * pen, mixed(FLOOR, colour, 0.6))
-        self._shapes.disc(centre, radius - 0.6 * pen, mixed(FLOOR, colour, 0.25))
+        fill, edge = mixed(FLOOR, colour, 0.25), mixed(FLOOR, colour, 0.6)
+        if robot.outline_polygon_mm is None:
+            self._shapes.disc(centre, radius + 0.6 * pen, edge)
+            self._shapes.disc(centre, radius - 0.6 * pen, fill)
+        else:
+            outline = body.px(self._outlines_mm[number].tolist())
+            self._shapes.fill(outline, fill)
+            self._shapes.stroke(outline, 1.2 * pen, edge)
         self._shapes.bar(
             body, (2 * half * view.scale, AXLE_MM * view.scale), mixed(FLOOR, colour, 0.6)
         )
-        ahead = robot.outline_front_mm
+        ahead = front_mm(robot)
         self._shapes.fill(body.px((ahead * e, ahead * f) for e, f in NOSE), colour)
         fork = body.at(0, -robot.castor_pivot_mm, scene.castor_rad[number])
         castor = fork.at(0, -robot.castor_trail_mm)
@@ -343,9 +462,18 @@ class Renderer:
             self._draw_tyre(view, wheel, DRIVE_WHEEL_WIDTH_MM, robot.wheel_radius_mm, slip)
             self._draw_treads(wheel, robot.wheel_radius_mm, angle)
         if scene.touched[number]:
-            self._shapes.ring(centre, radius, 2.5 * pen, ALARM)
+            self._draw_outline(number, body, 2.5 * pen, ALARM)
         if scene.lost[number]:
             self._shapes.cross(centre.at(0, 0, math.pi / 4), 0.9 * radius, 2.5 * pen, ALARM)
+
+    def _draw_outline(self, number: int, body: Place, width: float, colour: Colour) -> None:
+        """The line of a robot's outline."""
+        robot = self._robots[number]
+        if robot.outline_polygon_mm is None:
+            centre = body.at(0, -robot.outline_offset_mm)
+            self._shapes.ring(centre, robot.outline_radius_mm * body.scale, width, colour)
+        else:
+            self._shapes.stroke(body.px(self._outlines_mm[number].tolist()), width, colour)
 
     def _draw_tyre(
         self, view: View, wheel: Place, width_mm: float, radius_mm: float, slip_mm_s: float
@@ -373,9 +501,9 @@ class Renderer:
     def _draw_ghost(self, view: View, body: Place, scene: Scene, number: int) -> None:
         """The predecessor's outline one gap ago with a tick at its front, in the follower's colour."""
         robot, line = self._robots[number - 1], 1.3 * view.pen
-        radius, offset = robot.outline_radius_mm, robot.outline_offset_mm
-        self._shapes.ring(body.at(0, -offset), radius * view.scale, line, self._colours[number])
-        front = body.at(0, 1.1 * radius - offset)
+        radius = robot.outline_radius_mm
+        self._draw_outline(number - 1, body, line, self._colours[number])
+        front = body.at(0, front_mm(robot) + 0.1 * radius)
         self._shapes.bar(front, (line, 0.2 * radius * view.scale), self._colours[number])
 
     def _draw_reference(self, view: View, place: Place, scene: Scene, number: int) -> None:
@@ -428,6 +556,7 @@ class Renderer:
         self._canvas.set_clip(view.rect)
         step_mm = round_length(CLOSE_UP_RADII * self._robots[i].outline_radius_mm / 5)
         self._draw_floor(view, step_mm)
+        self._draw_objects(view, scene)
         self._draw_robots(view, scene)
         self._draw_scale_bar(view, step_mm)
         self._shapes.label(
@@ -469,12 +598,14 @@ class Renderer:
             self._write_robot(scene, i, top + i * LINE_PX * u)
 
     def _write_robot(self, scene: Scene, number: int, y: float) -> None:
-        """One line: colour, name, position error, time-gap error, lost or touched."""
+        """One line: colour, name, position error, time-gap error, lost, touched and by what."""
         u = self._text_unit
         x = EDGE_PX * u
         self._pg.draw.aacircle(self._picture, self._colours[number], (x + 5 * u, y + 6 * u), 5 * u)
         gap = f"{scene.time_gap_error_s[number]:+.3f} s" if number > 0 else ""
-        flags = [name for name in ("lost", "touched") if getattr(scene, name)[number]]
+        flags = ["lost"] if scene.lost[number] else []
+        if scene.touched[number]:
+            flags.append(f"touched {touched_name(int(scene.touched_by[number])) or ''}".strip())
         texts = (
             f"robot_{number}",
             _length_text(scene.position_error_mm[number]),

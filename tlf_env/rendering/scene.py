@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tlf_env.engine.formation import Formation
+from tlf_env.physics.shapes import PlacedShape
 from tlf_env.task.info import State
 
 STILL_MM = 1e-3  # a smaller displacement has no direction
@@ -39,6 +40,8 @@ class Scene(NamedTuple):
     time_gap_error_s: np.ndarray
     lost: np.ndarray  # bool
     touched: np.ndarray  # bool
+    touched_by: np.ndarray  # TouchedBy: what was touched first
+    objects: tuple[PlacedShape, ...] = ()  # everything in the space but the robots
 
 
 def scene_of(formation: Formation) -> Scene:
@@ -68,6 +71,10 @@ def scene_of(formation: Formation) -> Scene:
         time_gap_error_s=info.time_gap_error_s.copy(),
         lost=formation.arrays.lost[0].copy(),
         touched=formation.arrays.touched[0].copy(),
+        touched_by=formation.arrays.touched_by[0].copy(),
+        objects=tuple(
+            formation.plant.shapes(formation.arrays.rows("motion"), formation.step_count)
+        ),
     )
 
 

@@ -7,7 +7,7 @@ derives them. A scenario that exceeds them still runs.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
@@ -175,6 +175,27 @@ def wall_warnings(
         f"{_place(t_s, reference, first)}: the path leads the outline of a robot up to {deepest:.0f} mm "
         f"into {name}{more}"
     ]
+
+
+def largest_push(robot: RobotParameters) -> float:
+    """The largest steady force (N) with which a robot pushes: by its motors, or the grip of its tyres."""
+    idle = float(_motor_torque(robot, 0.0, 0.0, 0.0, 0.0))
+    motors = 2.0 * (robot.torque_limit_Nmm - idle) / robot.wheel_radius_mm
+    grip = robot.mass_kg * grip_acceleration(robot)[0] / MILLINEWTON_PER_NEWTON
+    return max(min(motors, grip), 0.0)
+
+
+def push_warnings(robots: Sequence[RobotParameters], world: World) -> Iterator[str]:
+    """A line for each body that could be pushed, but that all robots together cannot push."""
+    push = sum(map(largest_push, robots))
+    for number, thing in enumerate(world.pushables):
+        grip = thing.floor_friction * thing.mass_kg * robots[0].gravity_mm_s2
+        if grip > push * MILLINEWTON_PER_NEWTON:
+            yield (
+                f"world.pushables[{number}] holds to the floor with "
+                f"{grip / MILLINEWTON_PER_NEWTON:.3g} N, floor_friction·mass_kg·g; all robots together "
+                f"push with {push:.3g} N, so it yields to impacts only"
+            )
 
 
 def sensor_warnings(

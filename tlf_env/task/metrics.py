@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tlf_env.task.info import TouchedBy
 from tlf_env.task.scenario import Scenario
 
 ERROR_CAP_MM = 500.0
@@ -41,6 +42,12 @@ class RobotMetrics(NamedTuple):
     score: float  # 0 to 100
     lost: bool
     touched: bool
+    touched_by: str | None  # what it touched first: robot, wall or obstacle
+
+
+def touched_name(thing: int) -> str | None:
+    """Name of what a robot touched, a :class:`~tlf_env.TouchedBy`; None for nothing."""
+    return TouchedBy(thing).name.lower() if thing else None
 
 
 def rms(values: np.ndarray) -> float | None:
@@ -54,12 +61,14 @@ def robot_metrics(
     columns: Mapping[str, np.ndarray],
     lost_at_s: np.ndarray,
     touched_at_s: np.ndarray,
+    touched_by: np.ndarray | None = None,
 ) -> list[RobotMetrics]:
     """Metrics of every robot from a run's columns, each ``(time, robot)``.
 
     ``lost_at_s`` and ``touched_at_s`` ``(robot,)`` are the times at which a robot's error first exceeded
-    ``lost_beyond_mm`` and at which it first touched another robot, infinity if never. A robot also counts
-    as lost if its RMS error over the last 30 % of the run is above 100 mm.
+    ``lost_beyond_mm`` and at which it first touched another robot, a wall or an obstacle, infinity if never;
+    ``touched_by`` is what it touched, a :class:`~tlf_env.TouchedBy`. A robot also counts as lost if its RMS
+    error over the last 30 % of the run is above 100 mm.
     """
     settled = t_s >= scenario.settle_s
     tail = t_s >= (1 - LOST_TAIL_FRACTION) * scenario.horizon_s
@@ -97,6 +106,7 @@ def robot_metrics(
                 lost=bool(np.isfinite(lost_at_s[i]))
                 or (tail_rms is not None and tail_rms > LOST_RMS_MM),
                 touched=bool(np.isfinite(touched_at_s[i])),
+                touched_by=None if touched_by is None else touched_name(int(touched_by[i])),
             )
         )
     return out

@@ -13,6 +13,7 @@ from pydantic import (
     AfterValidator,
     Field,
     ValidationError,
+    ValidationInfo,
     field_validator,
     model_validator,
 )
@@ -45,6 +46,7 @@ from tlf_env.physics.world import World
 from tlf_env.task.actions import ActionKind
 from tlf_env.task.feasibility import (
     disturbed,
+    push_warnings,
     sensor_warnings,
     start_note,
     wall_warnings,
@@ -129,7 +131,9 @@ class Scenario(Frozen):
     physics_period_s: Positive = 0.001
     control_period_s: Positive = DEFAULT_CONTROL_PERIOD_S
     horizon_s: Positive = 100.0
-    plant: Literal["pymunk", "batch", "kinematic"] = "pymunk"
+    # What moves the robots: `pymunk` is the exact kernel, with contact in a pymunk space; `batch` the kernel
+    # alone; `kinematic` the wheels' commands; `chipmunk` pymunk's own bodies and constraints.
+    plant: Literal["pymunk", "batch", "kinematic", "chipmunk"] = "pymunk"
     world: World = World()
 
     wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
@@ -192,10 +196,14 @@ class Scenario(Frozen):
 
     @field_validator("world", mode="before")
     @classmethod
-    def _named_world(cls, value: Any) -> Any:
-        if isinstance(value, str):
-            return read_preset_or_file("world", value, ", nor a mapping")
-        return value
+    def _named_world(cls, value: Any, info: ValidationInfo) -> Any:
+        """A preset or a file; a relative path starts at the scenario's folder or the working directory."""
+        if not isinstance(value, str | Path):
+            return value
+        beside = Path((info.context or {}).get("folder", "")) / value
+        if is_file_name(value) and beside.is_file():
+            value = beside
+        return read_preset_or_file("world", value, ", nor a mapping")
 
     @field_validator("reward", mode="before")
     @classmethod
@@ -302,6 +310,10 @@ class Scenario(Frozen):
             raise ValueError(f"{role} {path!r} is a Python object, which cannot run in a batch")
         if self.adversary:
             raise ValueError("adversary True cannot be used with plant 'batch'")
+        if self.plant == "chipmunk":
+            raise ValueError(
+                "plant 'chipmunk' moves one formation at a time; 'batch' and 'kinematic' can run in a batch"
+            )
 
     @property
     def robot_count(self) -> int:
@@ -496,7 +508,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             scenario.start_spacing_mm,
         )
     ]
-    if scenario.world.statics:
+    if scenario.world.fixed:
         lines += [
             line
             for robot in dict.fromkeys(scenario.robot_models)
@@ -504,6 +516,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
                 scenario.trajectory, robot, scenario.world, scenario.horizon_s
             )
         ]
+    lines += push_warnings(scenario.robot_models, scenario.world)
     lines += _contact_warnings(scenario)
     if scenario.observation == "sensor":
         lines += sensor_warnings(
