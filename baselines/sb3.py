@@ -108,7 +108,14 @@ class FormationVecEnv(VecEnv):
     def _spaces_agree(self) -> None:
         first = self.plants[0].scenario
         for plant in self.plants[1:]:
-            for field in ("observation", "action", "preview_s", "dtype", "control_period_s"):
+            for field in (
+                "observation",
+                "action",
+                "preview_s",
+                "rays",
+                "dtype",
+                "control_period_s",
+            ):
                 mine, theirs = getattr(first, field), getattr(plant.scenario, field)
                 if mine != theirs:
                     raise ValueError(

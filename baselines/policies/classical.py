@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from tlf_env.onboard.rays import Rays
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S
@@ -17,8 +18,8 @@ class _Memoryless(ABC):
 
     privileged = False
 
-    def __init__(self, preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S) -> None:
-        entries = tracking_entries(preview_s)
+    def __init__(self, preview_s: tuple[float, ...], rays: Rays | None) -> None:
+        entries = tracking_entries(preview_s, rays)
         self._places = {name: i for i, name in enumerate(entries)}
         self._scales = np.array([entry.scale for entry in entries.values()])
 
@@ -38,7 +39,7 @@ class _Memoryless(ABC):
         Raises
         ------
         ValueError
-            if the observation does not have the entries of ``tracking`` with this policy's previews.
+            if the observation does not have the entries of ``tracking`` with this policy's previews and rays.
         """
         observation = np.asarray(observation)
         if observation.ndim not in (1, 2) or observation.shape[-1] != len(self._scales):
@@ -67,9 +68,12 @@ class PurePursuit(_Memoryless):
     """
 
     def __init__(
-        self, preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S, gain_per_s: float = 0.23
+        self,
+        preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S,
+        gain_per_s: float = 0.23,
+        rays: Rays | None = None,
     ) -> None:
-        super().__init__(preview_s)
+        super().__init__(preview_s, rays)
         if not preview_s or preview_s[0] <= 0:
             raise ValueError(
                 f"pure pursuit needs a first preview above 0, got preview_s {preview_s}"
@@ -100,8 +104,9 @@ class FeedbackLinearisation(_Memoryless):
         preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S,
         ahead_mm: float = 150.0,
         gain_per_s: float = 1.0,
+        rays: Rays | None = None,
     ) -> None:
-        super().__init__(preview_s)
+        super().__init__(preview_s, rays)
         self.ahead_mm = ahead_mm
         self.gain_per_s = gain_per_s
 

@@ -111,6 +111,7 @@ class LearnedPolicy:
         asked["residual_reach_mm"] = card.residual_reach_mm
         if card.observation == "tracking":
             asked["preview_s"] = card.preview_s
+        asked["rays"] = None if card.rays is None else card.rays.model_dump()
         self.scenario_overrides = {
             field: value
             for field, value in asked.items()

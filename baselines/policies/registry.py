@@ -34,6 +34,7 @@ OVERRIDABLE = (
     "estimator",
     "ekf_slip",
     "preview_s",
+    "rays",
 )
 
 
@@ -157,7 +158,7 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
     if head in CLASSICAL and not tail:
         check_interface(name, scenario, action="twist", observation="tracking")
-        return CLASSICAL[head](scenario.preview_s)
+        return CLASSICAL[head](scenario.preview_s, rays=scenario.rays)
     if tail:
         return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])
@@ -230,7 +231,7 @@ def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
     data, _, _ = load_from_zip_file(path, device="cpu")
     algorithm = _algorithm_of(data or {}, path)
     model = getattr(stable_baselines3, algorithm).load(path, device="cpu")
-    wanted = (len(tracking_entries(scenario.preview_s)),)
+    wanted = (len(tracking_entries(scenario.preview_s, scenario.rays)),)
     seen, given = model.observation_space.shape, model.action_space.shape
     if scenario.observation == "tracking" and (seen != wanted or given != (ACTION_SIZE,)):
         raise ValueError(

@@ -60,6 +60,9 @@ class Arrays(NamedTuple):
     signals: np.ndarray  # (variant, channel, SignalRow)
     patches: np.ndarray  # (variant, patch, PatchRow)
     walls: np.ndarray  # (capsule, Capsule): the static world
+    rays: (
+        np.ndarray
+    )  # (ray, 2): cosine and sine of the angle from forward of each range sensor's ray
     tables: np.ndarray  # (table, step, Reference): the leader's reference at the control steps
     # constants of an episode
     variants: np.ndarray  # (lane,) int64
@@ -99,6 +102,7 @@ class Arrays(NamedTuple):
     lost_now: np.ndarray  # (lane, robot) bool, for the first time in this step
     touched_now: np.ndarray
     touched_by: np.ndarray  # (lane, robot) int8: what was touched first, a TouchedBy
+    ranges: np.ndarray  # (lane, robot, ray): distances to what the rays meet, mm
     calm: np.ndarray  # (lane,) int64: the control step before which no robot can meet a wall
     ends: np.ndarray  # (lane, robot) int8: why the episode ended in this step, an EndReason
     scales: np.ndarray  # (entry,) of `tracking`
@@ -214,11 +218,13 @@ def make_arrays(
     scenario = scenarios[0]
     robots = scenario.robot_count
     dtype = np.dtype(scenario.dtype)
-    sensor = len(sensor_entries(scenario.substeps)) if scenario.observation == "sensor" else 0
+    tracking = tracking_entries(scenario.preview_s, scenario.rays)
+    sensor = sensor_entries(scenario.substeps, scenario.rays)
+    sensor_size = len(sensor) if scenario.observation == "sensor" else 0
+    rays = np.zeros((0, 2)) if scenario.rays is None else scenario.rays.directions
     gap = scenario.gap_steps
     window = round(TIME_GAP_WINDOW_S / scenario.control_period_s)
     lookahead = max(scenario.preview_steps, default=0)
-    entries = len(tracking_entries(scenario.preview_s))
 
     dead = max(round(longest(one, DEAD_TIME) / one.physics_period_s) for one in scenarios)
     late = max(math.ceil(longest(one, JITTER) / one.control_period_s) for one in scenarios)
@@ -237,6 +243,7 @@ def make_arrays(
         ),
         patches=_all_patches(scenarios),
         walls=capsule_rows(scenario.world),
+        rays=rays,
         tables=table[None].copy(),
         variants=np.arange(lanes) % len(scenarios),
         routes=np.zeros(lanes, dtype=np.int64),
@@ -262,8 +269,8 @@ def make_arrays(
         actions=np.zeros((lanes, robots, ACTION_SIZE)),
         last_actions=np.zeros((lanes, robots, ACTION_SIZE)),
         twists=np.zeros((lanes, robots, ACTION_SIZE), dtype=dtype),
-        observations=np.zeros((lanes, robots, entries), dtype=dtype),
-        sensor_observations=np.zeros((lanes, robots, sensor), dtype=dtype),
+        observations=np.zeros((lanes, robots, len(tracking)), dtype=dtype),
+        sensor_observations=np.zeros((lanes, robots, sensor_size), dtype=dtype),
         terms=np.zeros((lanes, robots, len(RewardTerms._fields))),
         rewards=np.zeros((lanes, robots)),
         infos=np.zeros((lanes, robots, len(Info._fields))),
@@ -272,12 +279,11 @@ def make_arrays(
         lost_now=np.zeros((lanes, robots), dtype=np.bool_),
         touched_now=np.zeros((lanes, robots), dtype=np.bool_),
         touched_by=np.zeros((lanes, robots), dtype=np.int8),
+        ranges=np.zeros((lanes, robots, len(rays))),
         calm=np.zeros(lanes, dtype=np.int64),
         ends=np.zeros((lanes, robots), dtype=np.int8),
-        scales=np.array([entry.scale for entry in tracking_entries(scenario.preview_s).values()]),
-        sensor_scales=np.array(
-            [entry.scale for entry in sensor_entries(scenario.substeps).values()]
-        ),
+        scales=np.array([entry.scale for entry in tracking.values()]),
+        sensor_scales=np.array([entry.scale for entry in sensor.values()]),
         weights=np.array([scenario.reward[name] for name in RewardTerms._fields]),
         previews=np.array(scenario.preview_steps, dtype=np.int64),
     )

@@ -37,6 +37,7 @@ from tlf_env.engine.judging import (
 from tlf_env.engine.layout import Trace, WheelPair, in_array
 from tlf_env.engine.outlines import away_from_walls, mark_touched, room_to_move, touch
 from tlf_env.engine.radio import broadcast, delayed_message, next_reference
+from tlf_env.engine.rays import capsule_at, cast_rays, is_reading, meet, report_rays
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.starting import STARTED, clear, start_lane
 from tlf_env.engine.substeps import trace_drive
@@ -161,6 +162,10 @@ def look_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
         observe_robot(arrays, lane, robot, step, settings)
         if arrays.sensor_observations.shape[2] > 0:
             observe_sensors(arrays, lane, robot, step, settings)
+    if is_reading(arrays, lane, settings):
+        for robot in range(robots):
+            cast_rays(arrays, lane, robot, settings)
+            report_rays(arrays, lane, robot, settings)
     if settings.cooperative:
         total = 0.0
         for robot in range(robots):
@@ -215,6 +220,21 @@ def uniform(seed: int, stream: int, number: int, episode: int) -> float:
     """A random number in [0, 1), for draws outside."""
     word, _, _, _ = words(seed, stream, number, episode, 0)
     return unit(word)
+
+
+@driver
+def cast_at(
+    arrays: Arrays, lane: int, capsules: np.ndarray, owners: np.ndarray, settings: Settings
+) -> None:
+    """Let the rays of a lane's last reading meet other capsules, too, ``(number, Capsule)``.
+
+    ``owners`` (number,) are the robots that do not see them, or −1.
+    """
+    for robot in range(arrays.states.shape[1]):
+        for number in range(capsules.shape[0]):
+            if owners[number] != robot:
+                meet(arrays, lane, robot, capsule_at(capsules, number), settings)
+        report_rays(arrays, lane, robot, settings)
 
 
 @driver

@@ -145,6 +145,7 @@ class Formation:
         self.plant.reset(arrays.rows("body")[:, :, 0], offsets_s)
         self._parts.reset(arrays, settings)
         drivers.look(arrays, ALONE, True, settings)
+        self._look_at_objects()
 
     def impose(self, values: Mapping[str, float | np.ndarray]) -> None:
         """Set channels for the coming control step: ``{path: value or one per robot}``.
@@ -214,6 +215,7 @@ class Formation:
         if objects == OUT_OF_REACH and result in (drivers.DONE, drivers.MUST_SUBSTEP):
             self.plant.advance_objects(motion, step, settings.substeps, settings.dt)
         if result == drivers.DONE:
+            self._look_at_objects()
             return
         if result >= 0:
             raise ValueError(
@@ -232,6 +234,16 @@ class Formation:
         if settings.external_observer:
             self._parts.observe(arrays, settings)
         drivers.look(arrays, ALONE, False, settings)
+        self._look_at_objects()
+
+    def _look_at_objects(self) -> None:
+        """Let the rays of the range sensors meet what only the space contains."""
+        arrays, settings, step = self.arrays, self._settings, self.step_count
+        if self.scenario.rays is None or step % settings.ray_period:
+            return
+        capsules, owners = self.plant.visible(arrays.rows("motion"), step)
+        if len(capsules):
+            drivers.cast_at(arrays, 0, capsules, owners, settings)
 
     def _substep_by_substep(self, close: bool) -> None:
         arrays, settings = self.arrays, self._settings

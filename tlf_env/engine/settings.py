@@ -9,6 +9,7 @@ from tlf_env.disturbances.model import changes_within_episode
 from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.kinds import ESTIMATOR_CODES, EXTERNAL
 from tlf_env.onboard.observer import ObserverParameters
+from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.tracking import ControllerRow, controller_row
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.scenario import Scenario
@@ -38,6 +39,9 @@ class Settings(NamedTuple):
     has_parts: bool  # objects in Python that are called between the substeps
     external_wheel_loop: bool
     external_observer: bool
+    ray_range: float  # mm
+    ray_noise: float  # standard deviation, mm
+    ray_period: int  # control steps from a reading of the range sensors to the next
     cooperative: bool  # every robot gets the formation's mean reward
     changing: bool  # whether a channel of every substep varies within an episode
     adversary: bool
@@ -50,6 +54,7 @@ def make_settings(scenario: Scenario) -> Settings:
     """The scenario's numbers as the drivers take them."""
     observer = scenario.observer
     paper = observer if isinstance(observer, ObserverParameters) else ObserverParameters()
+    rays = Rays() if scenario.rays is None else scenario.rays
     return Settings(
         kinematic=scenario.plant == "kinematic",
         by_chipmunk=scenario.plant == "chipmunk",
@@ -72,6 +77,9 @@ def make_settings(scenario: Scenario) -> Settings:
         has_parts=bool(scenario.part_paths),
         external_wheel_loop=isinstance(scenario.wheel_loop, str),
         external_observer=isinstance(observer, str),
+        ray_range=rays.range_mm,
+        ray_noise=rays.noise_std_mm,
+        ray_period=round((rays.period_s or scenario.control_period_s) / scenario.control_period_s),
         cooperative=scenario.cooperative,
         changing=changes_within_episode(scenario.disturbance),
         adversary=scenario.adversary,

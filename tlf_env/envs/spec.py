@@ -15,6 +15,7 @@ from tlf_env.task.info import MEANINGS
 from tlf_env.task.observation import (
     OBSERVATION_LIMIT,
     PREVIEW_ENTRIES,
+    RAY_MEANING,
     SAMPLE_ENTRIES,
     SENSOR_TAIL_ENTRIES,
     TRACKING_ENTRIES,
@@ -72,6 +73,11 @@ def observation_section() -> str:
             table(
                 ("entry", "meaning", "unit", "scale"),
                 [row[1:] for row in entry_rows(SENSOR_TAIL_ENTRIES)],
+            ),
+            "With range sensors (`rays`), both are followed by:",
+            table(
+                ("entry", "meaning", "unit", "scale"),
+                [("`ray_0` … `ray_{count − 1}`", RAY_MEANING, "mm", "`range_mm`")],
             ),
             f"Clipping limits the range of `sensor`: fixes and messages to ±{SENSOR_FIX_LIMIT_MM / 1e3:g} m "
             f"from the robot's own start,\nthe start itself to ±{SENSOR_START_LIMIT_MM / 1e3:g} m in the "
@@ -200,6 +206,34 @@ env.space.add(
 - While an object is near enough to a robot to act on it, and always with constraints or forces on robots or
   moving bodies, a control step takes [many times as long](world.md#what-it-costs). Objects out of reach change
   no bit of the robots' motion.
+
+## Range sensors
+
+With `rays`, every robot has a ring of range sensors, whose readings follow at the end of its observations:
+
+```python
+env = tlf_env.parallel_env(
+    "infinity", world="warehouse", rays={"count": 16, "range_mm": 1500.0, "noise_std_mm": 5.0}
+)
+observations, infos = env.reset(seed=0)
+readings_mm = observations["robot_1"][-16:] * env.scenario.rays.range_mm
+```
+
+- The rays start at the centre of the outline. `ray_0` points `first_angle_rad` (default 0) counter-clockwise
+  from forward, and the others follow counter-clockwise at equal angles, all relative to the true heading.
+- A reading is the distance from that centre to the first border of a robot, a wall, an obstacle, a pushed body
+  or an object of yours in the space. Shapes on the robot's own body and sensor shapes of pymunk are not seen.
+  If nothing is within `range_mm`, the reading is `range_mm`; inside a wall or a disc it is 0.
+- `noise_std_mm` adds white noise to every reading, which has its own random stream; readings stay within 0 and
+  `range_mm`.
+- `period_s` is the time between two readings, by default one control period. In between, the last one holds.
+- Walls, static obstacles and round robots are seen on every plant, with the same bits. Everything else needs
+  the plant `pymunk` or `chipmunk`.
+- Range sensors change no bit of the motion or of the other entries, and policies without rays act as before.
+
+Sixteen rays on each of three robots add 3.5 µs to a control step of 58 µs (7 µs with noise), and in a batch
+1.8 µs to 18 µs for each formation (3.5 µs with noise). Where the space contains more than walls, static
+obstacles and round robots, a reading takes 0.1 ms more.
 
 ## Many formations
 

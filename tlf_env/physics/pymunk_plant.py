@@ -17,6 +17,7 @@ import numpy as np
 import pymunk
 from pymunk.batch import BodyFields, Buffer, get_space_bodies
 
+from tlf_env.physics.borders import Borders
 from tlf_env.physics.objects import (
     Mover,
     Pushed,
@@ -29,7 +30,7 @@ from tlf_env.physics.parameters import Body, RobotParameters, body_array
 from tlf_env.physics.reach import CLOSE_MARGIN_MM, FASTEST_CHANGE_MM_S2, time_for, way
 from tlf_env.physics.shapes import PlacedShape, Pose, placed_link, placed_shape
 from tlf_env.physics.state import Motion
-from tlf_env.physics.world import World
+from tlf_env.physics.world import Capsule, World
 
 ITERATIONS = 20
 COLLISION_SLOP_MM = 0.1
@@ -38,6 +39,9 @@ SEPARATED = 3  # Chipmunk's state of a contact that has ended, and is remembered
 X, Y, THETA, V_X, V_Y, YAW = (
     Motion._fields.index(name) for name in ("x", "y", "theta", "v_x", "v_y", "w")
 )
+
+POSE = [X, Y, THETA]
+NOTHING, NOBODY = np.zeros((0, len(Capsule._fields))), np.zeros(0, dtype=np.int64)
 
 # What the objects in the space do within a control step, walls of the world apart.
 NO_OBJECTS, OUT_OF_REACH, WITHIN_REACH = range(3)
@@ -131,6 +135,8 @@ class PymunkPlant:
         self._floor = [joint for one in self._pushed for joint in one.joints]
         self._rests: dict[pymunk.Body, Rest] = {one.body: _rest(one.body) for one in self._pushed}
         self._shared = False  # whether a user has had the space
+        self._borders: Borders | None = None  # of what rays see in the space, and for which shapes
+        self._bordered: tuple[list[pymunk.Shape], list[bool]] = [], []
         self._buffer = Buffer()
         # Half the thickness and the farthest point of bodies, mm; found once per control step.
         self._sizes: dict[pymunk.Body, tuple[float, float]] = {}
@@ -253,6 +259,36 @@ class PymunkPlant:
         for mover in self._movers:
             mover.place(step * self._period_s, self._period_s)
             self._space.reindex_shapes_for_body(mover.body)
+
+    def visible(self, motions: np.ndarray, step: int) -> tuple[np.ndarray, np.ndarray]:
+        """What the space contains besides the walls of the world and round robots.
+
+        Capsules ``(number, Capsule)``, and the robots ``(number,)`` on whose bodies they are, or −1. Nothing in
+        the space changes, so that looking changes no motion.
+        """
+        round_only = all(polygon is None for polygon in self._polygons)
+        if round_only and not (self._shared or self._pushed or self._movers):
+            return NOTHING, NOBODY
+        shapes = list(self._space.shapes)
+        kinds = [shape.sensor for shape in shapes]
+        if self._borders is None or (shapes, kinds) != self._bordered:
+            skipped = {*self._walls, *(self._outlines if round_only else ())}
+            self._borders = Borders(
+                [one for one in shapes if one not in skipped and not one.sensor]
+            )
+            self._bordered = shapes, kinds
+        borders = self._borders
+        if not borders.bodies:
+            return NOTHING, NOBODY
+        moved = {mover.body: mover.at(step * self._period_s) for mover in self._movers}
+        owners = [self._number.get(body, -1) for body in borders.bodies]
+        poses = [
+            tuple(motions[POSE, owner, 0].tolist())
+            if owner >= 0
+            else (*moved.get(body, body.position), body.angle)
+            for body, owner in zip(borders.bodies, owners, strict=True)
+        ]
+        return borders.capsules(poses), np.array(owners, dtype=np.int64)[borders.body_of]
 
     def _stir(self) -> tuple[Any, ...]:
         """What would differ if a user had added, moved, or pulled at anything but a static shape.
@@ -514,7 +550,14 @@ class PymunkPlant:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
         if not self._corrections:
             self._corrections = [(body, _take_correction(body)) for body in self._space.bodies]
-        return {**self.__dict__, "_buffer": None, "_calm": (), "_sizes": {}}
+        return {
+            **self.__dict__,
+            "_buffer": None,
+            "_calm": (),
+            "_sizes": {},
+            "_borders": None,
+            "_bordered": ([], []),
+        }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _buffer=Buffer())

@@ -60,6 +60,7 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "residual_fade_mm": 0.0,
         "residual_reach_mm": None,
         "observation": "tracking",
+        "rays": None,
         "dtype": "float32",
         "preview_s": [0.5, 1.0],
         "reward": {
@@ -228,6 +229,13 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "start_s": 0.0,
         "random_start": False,
         "angle_rad": 0.0,
+    },
+    "Rays": {
+        "count": ALWAYS,
+        "range_mm": 1000.0,
+        "noise_std_mm": 0.0,
+        "period_s": None,
+        "first_angle_rad": 0.0,
     },
     "Constant": {"type": ALWAYS, "value": ALWAYS},
     "Step": {"type": ALWAYS, "value": ALWAYS, "at_s": ALWAYS, "before": None},

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
 from tlf_env.onboard.observer import Message, Reference
+from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.tracking import body_errors
 
 OBSERVATION_LIMIT = 10.0
@@ -120,14 +121,25 @@ PREVIEW_ENTRIES = {
 }
 
 
-def tracking_entries(preview_s: tuple[float, ...]) -> dict[str, Entry]:
+RAY_MEANING = "distance to the first thing that the ray meets, at most its range"
+
+
+def ray_entries(rays: Rays | None) -> dict[str, Entry]:
+    """Entries of the range sensors by name, ``ray_0`` and so on; none without range sensors."""
+    if rays is None:
+        return {}
+    one = Entry(RAY_MEANING, "mm", rays.range_mm)
+    return {f"ray_{i}": one for i in range(rays.count)}
+
+
+def tracking_entries(preview_s: tuple[float, ...], rays: Rays | None = None) -> dict[str, Entry]:
     """All entries by name, in order; the previews' names carry their time: ``forward_in_0.5_s``."""
     later = {
         f"{name}_in_{time_s:g}_s": entry
         for time_s in preview_s
         for name, entry in PREVIEW_ENTRIES.items()
     }
-    return TRACKING_ENTRIES | later
+    return TRACKING_ENTRIES | later | ray_entries(rays)
 
 
 @law
@@ -190,9 +202,9 @@ SENSOR_TAIL_ENTRIES = {
 }
 
 
-def sensor_entries(substeps: int) -> dict[str, Entry]:
+def sensor_entries(substeps: int, rays: Rays | None = None) -> dict[str, Entry]:
     """All entries of ``sensor`` by name, in order; the samples' names carry their number, oldest first."""
     samples = {
         f"{name}_{k}": entry for k in range(substeps) for name, entry in SAMPLE_ENTRIES.items()
     }
-    return samples | SENSOR_TAIL_ENTRIES
+    return samples | SENSOR_TAIL_ENTRIES | ray_entries(rays)

@@ -37,6 +37,7 @@ from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import PART_PATTERN
+from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
@@ -154,6 +155,7 @@ class Scenario(Frozen):
     residual_fade_mm: NonNegative = 0.0
     residual_reach_mm: Positive | None = None
     observation: Literal["tracking", "sensor"] = "tracking"
+    rays: Rays | None = None  # range sensors, at the end of the observation
     dtype: Literal["float32", "float64"] = "float32"  # of observations and actions
     preview_s: tuple[NonNegative, ...] = DEFAULT_PREVIEW_S
     reward: dict[str, Number] = Field(default_factory=lambda: FrozenDict(DEFAULT_WEIGHTS._asdict()))
@@ -242,6 +244,15 @@ class Scenario(Frozen):
                     f"{name} {getattr(self, name)} must be a multiple of control_period_s "
                     f"{self.control_period_s}"
                 )
+        between_s = self.control_period_s if self.rays is None else self.rays.period_s
+        if between_s is not None and (
+            between_s / self.control_period_s > MAX_STEPS
+            or whole_steps(between_s, self.control_period_s) in (None, 0)
+        ):
+            raise ValueError(
+                f"rays.period_s {between_s} must be a multiple of control_period_s "
+                f"{self.control_period_s}, at most {MAX_STEPS} of them"
+            )
         if len(set(self.preview_s)) < len(self.preview_s):
             raise ValueError(f"preview_s {self.preview_s} must not contain a time twice")
         for time_s in self.preview_s:
@@ -527,6 +538,12 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             time_gap_s=scenario.time_gap_s,
             start_spacing_mm=scenario.start_spacing_mm,
             start_ramp_s=scenario.start_ramp_s,
+        )
+    radius_mm = min(robot.outline_radius_mm for robot in scenario.robot_models)
+    if scenario.rays is not None and scenario.rays.range_mm <= radius_mm:
+        lines.append(
+            f"rays.range_mm {scenario.rays.range_mm:g} is at most outline_radius_mm {radius_mm:g}: rays "
+            "start at the centre of the outline, so that they meet nothing outside"
         )
     if scenario.estimator == "ekf" and controller(scenario.residual_base).limits.cancel_slip:
         lines.append(
