@@ -3,6 +3,7 @@
 PYTHON ?= python3
 TORCH ?= 2.13.0
 TESTS ?= tests
+JOBS ?= auto
 CLIENTS ?= $(basename $(notdir $(wildcard tests/clients/*.txt)))
 
 VENV := .venv
@@ -21,7 +22,7 @@ run: $(VENV)/.stamp-run ## Run the reference policy on the preset infinity; resu
 	$(BIN)/tlf run infinity --out results/infinity
 
 test: check ## Run the checks, then the tests
-	$(BIN)/pytest
+	$(BIN)/pytest -n $(JOBS) --dist loadfile
 
 test-slow: $(VENV)/.stamp-test ## Run the slow tests
 	$(BIN)/pytest -m slow

@@ -63,7 +63,7 @@ def run(
     torques_Nmm: ArrayLike = (0.0, 0.0),
     floor: ArrayLike = FLOOR,
     dt_s: float = DT_S,
-    objects: tuple[pymunk.Shape, ...] = (),
+    objects: tuple[pymunk.Body | pymunk.Shape, ...] = (),
 ) -> Run:
     """Drive robots; torques (left, right) and floor: one row, or one a substep."""
     plant = ChipmunkPlant([robot] * len(starts))
@@ -73,7 +73,7 @@ def run(
     torques = np.broadcast_to(1000.0 * np.asarray(torques_Nmm), (steps, 2))
     floors = np.broadcast_to(np.asarray(floor), (steps, 5))
     if objects:
-        plant.space(motions).add(*objects)
+        plant.space(motions, 0).add(*objects)
     rows = [(motions[:, :, 0].copy(), contacts[:, :, 0].copy())]
     for k in range(steps):
         if k % PER_CONTROL_STEP == 0:
@@ -426,3 +426,52 @@ def test_it_cannot_run_in_a_batch():
     assert "\n" not in str(caught.value)
     with pytest.raises(ValueError, match="plant 'rapier' cannot run open loop"):
         run_open_loop(SCENARIOS["spin"], plant="rapier")
+
+
+def test_fast_bodies_divide_a_substep_and_change_little():
+    """Nothing passes through a wall; a substep in parts has the motors' torques in each of them."""
+    start = rolling(forward=300.0)
+    bullet = pymunk.Body(1e-6, 1.0)
+    bullet.position, bullet.velocity = (5000.0, 0.0), (0.0, 3000.0)
+    whole = run([start], seconds=0.1, torques_Nmm=(9.0, 8.0)).motion
+    parted = run(
+        [start], seconds=0.1, torques_Nmm=(9.0, 8.0), objects=(bullet, pymunk.Circle(bullet, 2.0))
+    ).motion
+    assert not np.array_equal(whole.v_y, parted.v_y)
+    assert parted.v_y[-1, 0] == pytest.approx(whole.v_y[-1, 0], rel=1e-3)
+    assert parted.w[-1, 0] == pytest.approx(whole.w[-1, 0], abs=2e-3)
+
+
+def test_a_world_has_walls_things_to_push_and_moving_obstacles():
+    world = {
+        "walls": [{"points_mm": [[-2000.0, 600.0], [2000.0, 600.0]]}],
+        "pushables": [
+            {
+                "shape": {"type": "box", "width_mm": 100.0, "length_mm": 100.0},
+                "mass_kg": 0.5,
+                "x_mm": 0.0,
+                "y_mm": 220.0,
+                "floor_friction": 0.02,
+            }
+        ],
+    }
+    env = environment(robots=1, disturbance="none", world=world)
+    env.reset(seed=0, options={"poses": [[0.0, 0.0, 0.0]]})
+    for _ in range(120):
+        *_, infos = env.step({"robot_0": [0.3, 0.0]})
+    assert 300.0 < env.pushable_bodies[0].position.y < 600.0
+    assert infos["robot_0"]["y_mm"] + ROBOT.outline_front_mm < 600.0
+
+
+def test_a_reset_puts_a_trailer_back():
+    env = environment(robots=1, disturbance="none")
+    env.reset(seed=0, options={"poses": [[0.0, 0.0, 0.0]]})
+    trailer = pymunk.Body(0.5, 500.0)
+    trailer.position = 0.0, -300.0
+    rope = pymunk.SlideJoint(env.robot_bodies["robot_0"], trailer, (0, 0), (0, 0), 0.0, 310.0)
+    env.space.add(trailer, pymunk.Circle(trailer, 50.0), rope)
+    for _ in range(60):
+        env.step({"robot_0": [0.3, 0.0]})
+    assert trailer.position.y > -250.0
+    env.reset(seed=0)
+    assert tuple(trailer.position) == (0.0, -300.0)

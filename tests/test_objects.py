@@ -13,6 +13,7 @@ import pytest
 
 import tlf_env
 from baselines import ReferencePolicy
+from tlf_env.physics.pymunk_plant import farthest_point
 
 WALL_Y_MM = 3300.0
 
@@ -75,6 +76,33 @@ def test_a_wall_across_the_path_stops_the_leader():
     assert highest(rows) < WALL_Y_MM - 5.0 + 1.0
     assert highest(rows) > WALL_Y_MM - 2 * outline - 5.0
     assert infos["robot_0"]["touched"]
+
+
+@pytest.mark.parametrize("what", ["wall of the world", "wall", "box", "robot"])
+def test_a_bar_on_a_robot_meets_what_the_outline_does_not(what):
+    """A bar that a user fixes to a robot, 300 mm ahead of its centre of mass."""
+    line = {"points_mm": [[-300.0, 700.0], [300.0, 700.0]], "thickness_mm": 10.0}
+    world = {"walls": [line]} if what == "wall of the world" else {}
+    env = environment(robots=2, disturbance="none", world=world)
+    other = [0.0, 830.0, 0.0] if what == "robot" else [2000.0, 0.0, 0.0]
+    env.reset(seed=0, options={"poses": [[0.0, 0.0, 0.0], other]})
+    if what == "wall":
+        wall(env, *line["points_mm"])
+    pushed = box(env, (0.0, 775.0)) if what == "box" else None
+    env.space.add(pymunk.Segment(env.robot_bodies["robot_0"], (0, 100), (0, 300), 5))
+    for _ in range(200):
+        *_, infos = env.step({"robot_0": np.array([0.2, 0.0]), "robot_1": np.zeros(2)})
+    tip = infos["robot_0"]["y_mm"] - env.scenario.robot.com_offset_mm + 305.0
+    if what == "box":
+        assert pushed.position.y - 75.0 > tip - 1.0
+        assert pushed.position.y > 800.0
+        assert infos["robot_0"]["touched_by"] == tlf_env.TouchedBy.NOTHING
+    elif what == "robot":
+        assert infos["robot_0"]["touched_by"] == tlf_env.TouchedBy.ROBOT
+        assert infos["robot_1"]["y_mm"] - 140.0 > tip - 1.0
+    else:
+        assert tip < 696.0
+        assert infos["robot_0"]["touched_by"] == tlf_env.TouchedBy.WALL
 
 
 def test_touching_a_wall_ends_the_episode():
@@ -290,3 +318,25 @@ def test_a_plant_without_contact_refuses_objects(plant):
     with pytest.raises(ValueError, match=f"plant '{plant}' has no contact: .* need plant 'pymunk'"):
         env.step(still)
     assert np.array_equal(env.state(), before)
+
+
+def test_no_point_of_a_body_is_farther_away_at_any_angle_than_its_bound():
+    body = pymunk.Body(1.0, 1.0)
+    corners = [(-20.0, -10.0), (60.0, -10.0), (0.0, 40.0)]
+    shapes = {
+        math.hypot(30.0, 40.0) + 5.0: pymunk.Circle(body, 5.0, (30.0, 40.0)),
+        13.0 + 2.0: pymunk.Segment(body, (5.0, 12.0), (0.0, 0.0), 2.0),
+        math.hypot(60.0, 10.0): pymunk.Poly(body, corners),
+    }
+    for bound, shape in shapes.items():
+        alone = pymunk.Body(1.0, 1.0)
+        shape.body = alone
+        assert farthest_point(alone) == pytest.approx(bound)
+        reached = 0.0
+        for angle in np.linspace(0.0, 2.0 * math.pi, 721):
+            alone.angle = angle
+            box = shape.cache_bb()
+            reached = max(reached, *map(abs, box))
+        assert reached == pytest.approx(bound, rel=1e-4)
+    alone.center_of_gravity = (3.0, 4.0)
+    assert farthest_point(alone) == pytest.approx(bound + 5.0)

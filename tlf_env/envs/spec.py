@@ -182,7 +182,8 @@ env.space.add(
 ```
 
 - A robot that meets a static or kinematic shape (a wall, a moving obstacle) is `touched`, as by another robot,
-  and `touched_by` says which. A dynamic body (a box) can be pushed, and is not counted.
+  and `touched_by` says which. A dynamic body (a box) can be pushed, and is not counted. Shapes that you add to
+  a robot's body (a bar, a gripper) belong to its outline.
 - A contact has the product of both shapes' `friction` and `elasticity`. Those of the robots are
   `outline_friction` and `outline_restitution`, 0 by default; those of a new pymunk shape are 0, too.
 - Constraints, such as a [rope to a trailer](../examples/trailer_on_a_rope.py), and
@@ -194,6 +195,8 @@ env.space.add(
 - A dynamic body that you add slides without friction on the floor. A `PivotJoint` and a `GearJoint` to
   `space.static_body`, with `max_bias` 0 and a `max_force`, are floor friction; a body in the scenario's
   `pushables` has both.
+- Leave the space's own `gravity` and `damping` at 0 and 1: on a robot they would act only while something is
+  near. Use forces instead.
 - Robots get their places from the engine: to move a robot, use the option `poses` of `reset`; a position
   written to its body has no effect.
 - After moving a static shape by hand, call `env.space.reindex_shape(shape)`, and read `env.space` again, so

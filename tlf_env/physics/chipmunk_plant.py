@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 import pymunk
@@ -48,6 +47,7 @@ TORQUES = ("spin_l", "spin_r", "spin_c", "steering")
 
 ANGLES = [Motion._fields.index(name) for name in ("angle_l", "angle_r")]
 DRIVE_SPINS = [Motion._fields.index(name) for name in ("omega_l", "omega_r")]
+CONTACT_IMPULSES = Contact._fields.index("slip_l")  # they come first
 INVERSE_J = Body._fields.index("inverse_J")
 
 read_floor = reader(Floor)
@@ -390,6 +390,7 @@ class ChipmunkPlant(PymunkPlant):
         """As of the plant ``pymunk``."""
         super().reset(constants, mover_offsets_s)
         self._torques = np.zeros((2, len(self.bodies)))  # of the last substep
+        self._dt = 0.0
 
     def _weigh(self, body: pymunk.Body, robot: Body) -> None:
         i = self.bodies.index(body)
@@ -404,22 +405,17 @@ class ChipmunkPlant(PymunkPlant):
             w = robot.chassis.angular_velocity
             robot.chassis.velocity -= robot.chassis.rotation_vector * (robot.ahead * w)
 
-    def objects(self, *args: Any) -> int:
+    def objects(self, motions: np.ndarray, step: int) -> int:
         """Something may always act on a robot, because it moves in the space only."""
-        super().objects(*args)
+        super().objects(motions, step)
         return WITHIN_REACH
 
-    def sort(self, motions: np.ndarray, *args: Any) -> None:
+    def sort(self, motions: np.ndarray, step: int = 0) -> None:
         """Begin a control step at ``motions`` (field, robot, 1): all bodies and constraints join the space."""
-        super().sort(motions, *args)
-        users = list(self._space.constraints)
-        if users:
-            self._space.remove(*users)
+        super().sort(motions, step)
         for i, robot in enumerate(self._robots):
             robot.join(self._space)
             robot.write(Motion(*motions[:, i, 0].tolist()))
-        if users:  # again, so that they come in the same order in a copy as in the original
-            self._space.add(*users)
 
     def release(self) -> None:
         """End a control step: only the chassis stay in the space."""
@@ -435,6 +431,22 @@ class ChipmunkPlant(PymunkPlant):
         dt: float,
     ) -> None:
         """One substep in place; arrays (field, robot, 1), torques in mN·mm, ``floors`` as :class:`Floor`."""
+        self.hits = {}
+        parts = self._splits(dt)
+        for _ in range(parts):
+            self._advance_once(motions, contacts, torques, floors, dt / parts)
+
+    def _advance_once(
+        self,
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        torques: np.ndarray,
+        floors: np.ndarray,
+        dt: float,
+    ) -> None:
+        if self._dt not in (0.0, dt):  # the impulses of a substep of another length
+            contacts[:CONTACT_IMPULSES] *= dt / self._dt
+        self._dt = dt
         jumps, self._torques = torques[:, :, 0] - self._torques, torques[:, :, 0].copy()
         self._limit(motions, contacts, floors, jumps, dt)
         spins = motions[DRIVE_SPINS, :, 0]
@@ -444,7 +456,7 @@ class ChipmunkPlant(PymunkPlant):
             for constraint, limit in zip(robot.limited, self._limits[:, i].tolist(), strict=True):
                 constraint.max_force = limit
             robot.place(spins[:, i].tolist(), floors[:2, i, 0].tolist(), dt)
-        self._run(dt)
+        self._step_once(dt)
         for i, robot in enumerate(self._robots):
             motions[:, i, 0] = robot.read(*angles[:, i].tolist())
             self._impulses[:, i] = [constraint.impulse for constraint in robot.limited]

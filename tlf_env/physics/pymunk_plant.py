@@ -138,6 +138,8 @@ class PymunkPlant:
         self._borders: Borders | None = None  # of what rays see in the space, and for which shapes
         self._bordered: tuple[list[pymunk.Shape], list[bool]] = [], []
         self._buffer = Buffer()
+        # Half the thickness and the farthest point of bodies, mm; found once per control step.
+        self._sizes: dict[pymunk.Body, tuple[float, float]] = {}
         self._calm: tuple[Any, ...] = ()
         self.reset()
 
@@ -355,18 +357,24 @@ class PymunkPlant:
         """
         space, period_s = self._space, self._period_s
         calm_s = MOST_CALM_S
-        for body, outline in zip(self.bodies, self._outlines, strict=True):
-            speed = _fastest_point(body) + fastest
+        speeds = [_fastest_point(body) for body in self.bodies]
+        for body, outline, own_speed in zip(self.bodies, self._outlines, speeds, strict=True):
+            # The compiled laws know of outlines and walls, but not of shapes that a user adds to a robot.
+            enlarged = len(body.shapes) > 1
+            speed = own_speed + (max([fastest, *speeds]) if enlarged else fastest)
             box = outline.cache_bb()
             centre = ((box.left + box.right) / 2, (box.bottom + box.top) / 2)
             size = math.hypot(box.right - box.left, box.top - box.bottom) / 2
             if isinstance(outline, pymunk.Circle):
                 size = outline.radius
+            if enlarged:
+                centre, size = (body.position.x, body.position.y), farthest_point(body)
             room = CLOSE_MARGIN_MM + (speed + 2.0 * FASTEST_CHANGE_MM_S2 * period_s) * period_s
             wide = size + CLOSE_MARGIN_MM + way(speed, MOST_CALM_S)
             near = pymunk.BB(centre[0] - wide, centre[1] - wide, centre[0] + wide, centre[1] + wide)
             for shape in space.bb_query(near, pymunk.ShapeFilter()):
-                if shape.body in self._number or shape in self._walls:
+                known = shape.body in self._number or shape in self._walls
+                if shape.body is body or (known and not enlarged):
                     continue
                 apart = shape.point_query(centre).distance - size
                 if apart <= room:
@@ -392,20 +400,32 @@ class PymunkPlant:
 
     def _step_space(self, dt: float) -> None:
         """A step of the space, in parts if a body would move far compared with its thickness."""
+        parts = self._splits(dt)
+        for _ in range(parts):
+            self._step_once(dt / parts)
+
+    def _splits(self, dt: float) -> int:
+        """In how many parts a step of the space has to be made."""
         farthest = 0.0
         for body in self._space.bodies:
-            if body.shapes and not _is_still(body):
-                farthest = max(farthest, _fastest_point(body) * dt / half_thickness(body))
-        parts = min(max(1, math.ceil(farthest / LARGEST_MOVE)), MOST_SPLITS)
-        for _ in range(parts):
-            for body, force, torque in self._forces:
-                body.force, body.torque = force, torque
-            if self._corrections:
-                self._step_after_a_copy(dt / parts)
-            else:
-                self._space.step(dt / parts)
-            for i, body in enumerate(self.bodies):
-                body.each_arbiter(self._remember, i)
+            if _is_still(body) or not body.shapes:
+                continue
+            if body not in self._sizes:
+                self._sizes[body] = half_thickness(body), farthest_point(body)
+            half, radius = self._sizes[body]
+            speed = body.velocity.length + abs(body.angular_velocity) * radius
+            farthest = max(farthest, speed * dt / half)
+        return min(max(1, math.ceil(farthest / LARGEST_MOVE)), MOST_SPLITS)
+
+    def _step_once(self, dt: float) -> None:
+        for body, force, torque in self._forces:
+            body.force, body.torque = force, torque
+        if self._corrections:
+            self._step_after_a_copy(dt)
+        else:
+            self._space.step(dt)
+        for i, body in enumerate(self.bodies):
+            body.each_arbiter(self._remember, i)
 
     def _write(self, poses: np.ndarray, velocities: np.ndarray) -> None:
         for i, body in enumerate(self.bodies):
@@ -444,6 +464,7 @@ class PymunkPlant:
             if body.force != (0.0, 0.0) or body.torque
         ]
         self._pulled = {i for i, body in enumerate(self.bodies) if _is_forced(body)}
+        self._sizes.clear()
 
     def _forget_constraints(self) -> None:
         """Set the impulses that constraints remember to 0; to be called before a control step.
@@ -481,7 +502,8 @@ class PymunkPlant:
         """
         self._write(before, motions)
         self._moved_before, self._moved = self._moved, set()
-        self._run(dt)
+        self.hits = {}
+        self._step_space(dt)
         self._moved |= self._pulled
         for i in self._moved | self._moved_before:
             body = self.bodies[i]
@@ -492,11 +514,6 @@ class PymunkPlant:
 
     def release(self) -> None:
         """Called after a control step that ran substep by substep."""
-
-    def _run(self, dt: float) -> None:
-        """A substep of the space, and which robots a contact has moved in it."""
-        self.hits = {}
-        self._step_space(dt)
 
     def _remember(self, arbiter: pymunk.Arbiter, robot: int) -> None:
         self._moved.add(robot)
@@ -537,6 +554,7 @@ class PymunkPlant:
             **self.__dict__,
             "_buffer": None,
             "_calm": (),
+            "_sizes": {},
             "_borders": None,
             "_bordered": ([], []),
         }
@@ -558,6 +576,21 @@ def _half_width(shape: pymunk.Shape) -> float:
         heights = np.ptp(corners @ normals, axis=0)
         return float(heights.min()) / 2 + shape.radius
     return float(shape.radius) if isinstance(shape, pymunk.Circle | pymunk.Segment) else 0.0
+
+
+def farthest_point(body: pymunk.Body) -> float:
+    """A bound on the distance of all points of a body's shapes from its centre of mass, mm."""
+    return max(map(_farthest_of, body.shapes)) + body.center_of_gravity.length
+
+
+def _farthest_of(shape: pymunk.Shape) -> float:
+    if isinstance(shape, pymunk.Circle):
+        return float(shape.offset.length + shape.radius)
+    if isinstance(shape, pymunk.Segment):
+        return float(max(shape.a.length, shape.b.length) + shape.radius)
+    if isinstance(shape, pymunk.Poly):
+        return float(max(corner.length for corner in shape.get_vertices()) + shape.radius)
+    return 0.0
 
 
 def _rest(body: pymunk.Body) -> Rest:
