@@ -48,7 +48,7 @@ ROW_EVERY_S = 0.1
 MAX_DURATION_S = 1e5
 MAX_TORQUE_NMM = 1e6
 MAX_SUBSTEPS = 100_000_000
-STILL_FLOOR = Floor(0.0, 0.0, 1.0, 1.0, 1.0)
+STILL_FLOOR = Floor(conveyor_l=0.0, conveyor_r=0.0, grip_l=1.0, grip_r=1.0, grip_c=1.0)
 OPEN_LOOP_PLANTS = ("kernel", "chipmunk")
 # Far beyond any robot, and small enough that squares and products in the plant stay finite.
 MAX_MM = 1e9  # and mm/s
