@@ -86,7 +86,7 @@ def _rates(robot: Body, state: np.ndarray, torques_Nmm: np.ndarray) -> np.ndarra
         robot,
         motion,
         Contact(*(0.0,) * len(Contact._fields)),
-        Floor(0.0, 0.0, 1.0, 1.0, 1.0, 0.0, 0.0),
+        Floor(conveyor_l=0.0, conveyor_r=0.0, grip_l=1.0, grip_r=1.0, grip_c=1.0),
         Push(0.0, 0.0, 0.0),
         torque_l,
         torque_r,
