@@ -15,7 +15,7 @@ from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
 from tlf_env.disturbances.table import unit
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.physics.world import (
     BoxShape,
     CircleShape,
