@@ -101,6 +101,7 @@ class Formation:
         self.plant = kind(scenario.robot_models, scenario.world, scenario.control_period_s)
         self._parts = Parts(part_factories(scenario, parts or {}), scenario)
         self._settings = make_settings(scenario)
+        self._has_rays = scenario.rays is not None
         self._left = drivers.lanes_to_step(0, 1)
         self._nothing = empty_excerpt(self.arrays, 0, 0)
 
@@ -145,7 +146,8 @@ class Formation:
         self.plant.reset(arrays.rows("body")[:, :, 0], offsets_s)
         self._parts.reset(arrays, settings)
         drivers.look(arrays, ALONE, True, settings)
-        self._look_at_objects()
+        if self._has_rays:
+            self._look_at_objects()
 
     def impose(self, values: Mapping[str, float | np.ndarray]) -> None:
         """Set channels for the coming control step: ``{path: value or one per robot}``.
@@ -202,20 +204,23 @@ class Formation:
             a robot, on a plant without contact. Then nothing has changed.
         """
         arrays, settings = self.arrays, self._settings
-        motion, step = arrays.rows("motion"), self.step_count
-        objects = self.plant.objects(motion, step)
-        if objects != NO_OBJECTS and not settings.collides:
-            raise ValueError(
-                f"plant {self.scenario.plant!r} has no contact: objects in the space need plant 'pymunk'"
-            )
+        objects, step = NO_OBJECTS, 0
+        if self.plant.occupied:
+            step = self.step_count
+            objects = self.plant.objects(arrays.rows("motion"), step)
+            if objects != NO_OBJECTS and not settings.collides:
+                raise ValueError(
+                    f"plant {self.scenario.plant!r} has no contact: objects in the space need plant 'pymunk'"
+                )
         self._left[0] = 0
         by_substep = objects == WITHIN_REACH and not settings.has_parts
         given = settings._replace(has_parts=True) if by_substep else settings
         result = drivers.control_step(arrays, self._left, self._nothing, given)
         if objects == OUT_OF_REACH and result in (drivers.DONE, drivers.MUST_SUBSTEP):
-            self.plant.advance_objects(motion, step, settings.substeps, settings.dt)
+            self.plant.advance_objects(arrays.rows("motion"), step, settings.substeps, settings.dt)
         if result == drivers.DONE:
-            self._look_at_objects()
+            if self._has_rays:
+                self._look_at_objects()
             return
         if result >= 0:
             raise ValueError(
@@ -234,12 +239,13 @@ class Formation:
         if settings.external_observer:
             self._parts.observe(arrays, settings)
         drivers.look(arrays, ALONE, False, settings)
-        self._look_at_objects()
+        if self._has_rays:
+            self._look_at_objects()
 
     def _look_at_objects(self) -> None:
         """Let the rays of the range sensors meet what only the space contains."""
         arrays, settings, step = self.arrays, self._settings, self.step_count
-        if self.scenario.rays is None or step % settings.ray_period:
+        if step % settings.ray_period:
             return
         capsules, owners = self.plant.visible(arrays.rows("motion"), step)
         if len(capsules):

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -61,7 +60,7 @@ def info_of(arrays: Arrays, key: str) -> np.ndarray:
 
 
 def info_rows(
-    arrays: Arrays, lane: int = 0, channels: Sequence[int] | slice = slice(None)
+    arrays: Arrays, lane: int = 0, channels: np.ndarray | slice = slice(None)
 ) -> list[tuple[float, ...]]:
     """The infos of a formation's robots, each a tuple in the order of ``INFO_KEYS``.
 

@@ -107,12 +107,15 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self.agents: list[Agent] = []
         self._formation = Formation(self.scenario, parts)
         # Channels that stay for a whole episode are taken from its first infos.
-        self._varying = [
-            i
-            for i, channel in enumerate(CHANNELS)
-            if self.scenario.adversary
-            or not self.scenario.disturbance.signal(channel.path).is_steady()
-        ]
+        self._varying = np.array(
+            [
+                i
+                for i, channel in enumerate(CHANNELS)
+                if self.scenario.adversary
+                or not self.scenario.disturbance.signal(channel.path).is_steady()
+            ],
+            dtype=np.intp,
+        )
         steady = {one.key for i, one in enumerate(CHANNELS) if i not in self._varying}
         self._varying_keys = [key for key in INFO_KEYS if key not in steady]
         self._first_infos: list[dict[str, Any]] = []
@@ -320,17 +323,19 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             return {agent: {} for agent in self.possible_agents}
         if self._formation.step_count and len(keys) == len(INFO_KEYS):
             changed = info_rows(arrays, channels=self._varying)
-            named = [
-                first | dict(zip(self._varying_keys, row, strict=True))
-                for first, row in zip(self._first_infos, changed, strict=True)
-            ]
-            return dict(zip(self.possible_agents, named, strict=True))
+            named = {}
+            for agent, first, row in zip(
+                self.possible_agents, self._first_infos, changed, strict=True
+            ):
+                named[agent] = first.copy()
+                named[agent].update(zip(self._varying_keys, row, strict=True))
+            return named
         rows: Sequence[Sequence[float]] = info_rows(arrays)
         if len(keys) < len(INFO_KEYS):
             rows = [[row[i] for i in pick] for row in rows]
-        named = [dict(zip(keys, row, strict=True)) for row in rows]
-        self._first_infos = named
-        return dict(zip(self.possible_agents, [one.copy() for one in named], strict=True))
+        self._first_infos = [dict(zip(keys, row, strict=True)) for row in rows]
+        copies = [info.copy() for info in self._first_infos]
+        return dict(zip(self.possible_agents, copies, strict=True))
 
     def state(self) -> np.ndarray:
         """The true state for critics: scaled :class:`tlf_env.task.info.State` of every robot.

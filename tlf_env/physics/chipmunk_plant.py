@@ -405,6 +405,11 @@ class ChipmunkPlant(PymunkPlant):
             w = robot.chassis.angular_velocity
             robot.chassis.velocity -= robot.chassis.rotation_vector * (robot.ahead * w)
 
+    @property
+    def occupied(self) -> bool:
+        """Always: the robots themselves move in the space."""
+        return True
+
     def objects(self, motions: np.ndarray, step: int) -> int:
         """Something may always act on a robot, because it moves in the space only."""
         super().objects(motions, step)

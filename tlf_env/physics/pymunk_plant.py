@@ -306,14 +306,17 @@ class PymunkPlant:
             [body.position_func for body in space.bodies],
         )
 
+    @property
+    def occupied(self) -> bool:
+        """Whether there may be anything in the space but the robots and the walls of the world."""
+        return bool(self._shared or self._pushed or self._movers)
+
     def objects(self, motions: np.ndarray, step: int) -> int:
         """What objects could do within a control step: all but the walls of the world.
 
         ``NO_OBJECTS``: there are none, or they cannot act on a robot, and none has to be moved;
         ``OUT_OF_REACH``: some move, but cannot act on a robot; ``WITHIN_REACH``: something may act on a robot.
         """
-        if not (self._shared or self._pushed or self._movers):
-            return NO_OBJECTS
         if step < self._calm_until and self._stir() == self._calm:
             return NO_OBJECTS
         space = self._space
