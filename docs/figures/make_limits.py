@@ -105,7 +105,7 @@ def cell(entry: tuple[str, dict[str, Any]], fields: dict[str, Any], seeds: range
     runs = [record.metrics() for record in run_seeds(driven, fitted.policy, seeds, name=name)]
     rms_mm = np.median([max(robot.position_rmse_mm or 0.0 for robot in run) for run in runs])
     lost = sum(map(failed, runs))
-    return f"{rms_mm:.3g}" + (f" ({lost})" if lost else "")
+    return f"{float(f'{rms_mm:.3g}'):g}" + (f" ({lost})" if lost else "")
 
 
 def table(rows: dict[str, dict[str, Any]], seeds: range) -> str:
