@@ -32,6 +32,7 @@ from tlf_env.physics.openloop import (
 )
 from tlf_env.physics.parameters import Body, RobotParameters, body_array
 from tlf_env.physics.state import Contact, Floor, Motion
+from tlf_env.physics.sweeps import Slips
 from tlf_env.task.scenario import load_scenario
 
 GOLDEN = ROOT / "tests" / "golden"
@@ -100,11 +101,25 @@ class OneJointPlant(ChipmunkPlant):
 
     kind = OneJointPerTyre
 
-    def _limit(self, motions, contacts, floors, jumps, dt) -> None:  # type: ignore[no-untyped-def]
+    def _limit(
+        self,
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        floors: np.ndarray,
+        jumps: np.ndarray,
+        dt: float,
+    ) -> None:
         most, _ = limits_now(self, motions, contacts, floors, dt)
         self._limits[:, 0] = np.array(most) / dt
 
-    def _record(self, motions, contacts, floors, spins, dt) -> None:  # type: ignore[no-untyped-def]
+    def _record(
+        self,
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        floors: np.ndarray,
+        spins: np.ndarray,
+        dt: float,
+    ) -> None:
         r, motion = Body(*self._constants[:, 0]), Motion(*motions[:, 0, 0])
         left, right, castor, q_l, q_r, q_c, q_s = self._impulses[:, 0].tolist()
         along = [
@@ -137,7 +152,14 @@ class OneJointPlant(ChipmunkPlant):
 class LastSlipPlant(ChipmunkPlant):
     """A sliding tyre's limits follow the direction of the last slip alone; a sticking one's are equal."""
 
-    def _limit(self, motions, contacts, floors, jumps, dt) -> None:  # type: ignore[no-untyped-def]
+    def _limit(
+        self,
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        floors: np.ndarray,
+        jumps: np.ndarray,
+        dt: float,
+    ) -> None:
         most, s = limits_now(self, motions, contacts, floors, dt)
         pairs = [
             parts(circle, *slip)
@@ -150,7 +172,14 @@ class LastSlipPlant(ChipmunkPlant):
 class NoJumpPlant(ChipmunkPlant):
     """The motors' next torques are not used."""
 
-    def _limit(self, motions, contacts, floors, jumps, dt) -> None:  # type: ignore[no-untyped-def]
+    def _limit(
+        self,
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        floors: np.ndarray,
+        jumps: np.ndarray,
+        dt: float,
+    ) -> None:
         super()._limit(motions, contacts, floors, np.zeros_like(jumps), dt)
 
 
@@ -170,13 +199,27 @@ class UnsharedPlant(ChipmunkPlant):
 
     kind = TwoAlongTheAxle
 
-    def _limit(self, motions, contacts, floors, jumps, dt) -> None:  # type: ignore[no-untyped-def]
+    def _limit(
+        self,
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        floors: np.ndarray,
+        jumps: np.ndarray,
+        dt: float,
+    ) -> None:
         all_limits, self._limits = self._limits, np.zeros((9, 1))
         super()._limit(motions, contacts, floors, jumps, dt)
         both, self._limits = self._limits, all_limits
         self._limits[:, 0] = [both[0, 0] / 2, *both[1:5, 0], both[0, 0] / 2, *both[5:, 0]]
 
-    def _record(self, motions, contacts, floors, spins, dt) -> None:  # type: ignore[no-untyped-def]
+    def _record(
+        self,
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        floors: np.ndarray,
+        spins: np.ndarray,
+        dt: float,
+    ) -> None:
         impulses = self._impulses
         left, right = float(impulses[0, 0]), float(impulses[5, 0])
         self._impulses = np.delete(impulses, 5, axis=0)
@@ -206,14 +249,21 @@ def parts(circle: float, s_1: float, s_2: float) -> tuple[float, float]:
     return circle * abs(s_1) / size, circle * abs(s_2) / size
 
 
-def limits_now(plant, motions, contacts, floors, dt):  # type: ignore[no-untyped-def]
-    """The kernel's friction limits of a lone robot, and its tyres' slips."""
+def limits_now(
+    plant: ChipmunkPlant,
+    motions: np.ndarray,
+    contacts: np.ndarray,
+    floors: np.ndarray,
+    dt: float,
+) -> tuple[tuple[float, ...], Slips]:
+    """The kernel's limits of friction of a lone robot (tyres, axles, steering), and its tyres' slips."""
     r, motion = Body(*plant._constants[:, 0]), Motion(*motions[:, 0, 0])
     floor = Floor(*floors[:, 0, 0])
     most = friction_limits(r, motion, Contact(*contacts[:, 0, 0]), floor, dt)
-    return most, slips_of(r, motion, floor)[0]
+    return most[:LIMITS], slips_of(r, motion, floor)[0]
 
 
+LIMITS = 7  # of FrictionLimits: three tyres, three axles, the steering; its compliances follow
 Make = Callable[[RobotParameters], ChipmunkPlant]
 VARIANTS: dict[str, Make] = {
     "the plant `chipmunk`": lambda robot: ChipmunkPlant([robot]),

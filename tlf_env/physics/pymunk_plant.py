@@ -41,7 +41,7 @@ X, Y, THETA, V_X, V_Y, YAW = (
 )
 
 POSE = [X, Y, THETA]
-NOTHING, NOBODY = np.zeros((0, len(Capsule._fields))), np.zeros(0, dtype=np.int64)
+NO_CAPSULES, NO_OWNERS = np.zeros((0, len(Capsule._fields))), np.zeros(0, dtype=np.int64)
 
 # What the objects in the space do within a control step, walls of the world apart.
 NO_OBJECTS, OUT_OF_REACH, WITHIN_REACH = range(3)
@@ -268,7 +268,7 @@ class PymunkPlant:
         """
         round_only = all(polygon is None for polygon in self._polygons)
         if round_only and not (self._shared or self._pushed or self._movers):
-            return NOTHING, NOBODY
+            return NO_CAPSULES, NO_OWNERS
         shapes = list(self._space.shapes)
         kinds = [shape.sensor for shape in shapes]
         if self._borders is None or (shapes, kinds) != self._bordered:
@@ -279,7 +279,7 @@ class PymunkPlant:
             self._bordered = shapes, kinds
         borders = self._borders
         if not borders.bodies:
-            return NOTHING, NOBODY
+            return NO_CAPSULES, NO_OWNERS
         moved = {mover.body: mover.at(step * self._period_s) for mover in self._movers}
         owners = [self._number.get(body, -1) for body in borders.bodies]
         poses = [
