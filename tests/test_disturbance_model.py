@@ -191,6 +191,16 @@ PRESETS = {
         },
     },
     "ice": {"tyre.friction_scale": 0.5},
+    "split-ice": {"tyre.friction_left": 0.6},
+    "patches": {},
+    "creep": {"tyre.creep": 0.1},
+    "rolling": {"floor.rolling_resistance": 0.004},
+    "slope": {"floor.slope_rad": 0.005},
+    "pushes": {
+        "push.x_N": {"type": "band_limited", "std": 0.03, "correlation_s": 0.5},
+        "push.y_N": {"type": "band_limited", "std": 0.03, "correlation_s": 0.5},
+        "push.torque_Nmm": {"type": "band_limited", "std": 2, "correlation_s": 0.5},
+    },
     "start": {"start.position_std_mm": 80, "start.heading_std_rad": 0.3},
     "payload": {
         "payload.mass_kg": uniform(0.126, 0.18),
@@ -218,6 +228,17 @@ PRESETS = {
 }
 
 
+# x_mm, y_mm, radius_mm and friction_scale of the presets with patches
+PATCHES = {
+    "patches": [
+        (4495.0, 2782.0, 250.0, 0.4),
+        (4056.0, 545.0, 250.0, 0.4),
+        (986.0, 4479.0, 250.0, 0.4),
+        (582.0, 1412.0, 250.0, 0.4),
+    ]
+}
+
+
 def test_presets_are_those_of_the_folder():
     assert sorted(PRESETS) == preset_names("disturbance")
 
@@ -227,7 +248,9 @@ def test_presets_hold_their_numbers_and_nothing_else(name):
     found = load_scenario(disturbance=name).disturbance
     assert found.name == name
     assert found.level == 1
-    assert found.tyre.patches == ()
+    assert [tuple(patch.model_dump().values()) for patch in found.tyre.patches] == PATCHES.get(
+        name, []
+    )
     expected = Disturbance.model_validate({"name": name, **tree(PRESETS[name])})
     for path in PATHS:
         one, other = (d.signal(path).model_dump() for d in (found, expected))

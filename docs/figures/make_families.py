@@ -9,11 +9,13 @@ about half an hour and needs the extra ``figures``. ``--only FAMILY`` renews one
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable
 from typing import Any
 
-from family_draws import DRAWINGS
+from family_devices import draw_motors, draw_robots, draw_sensors
+from family_outside import draw_floor, draw_grip, draw_slip
 from make_board import DOCS
-from make_limits import SMOOTH, friction, noise, ramped, sines, table, wet
+from make_limits import SMOOTH, counts, friction, noise, ramped, sines, table, wet
 from make_parts import put
 from matplotlib.figure import Figure
 
@@ -25,6 +27,16 @@ from tlf_env.task.scenario import load_scenario
 FOLDER = DOCS / "disturbances"
 DPI = 100
 BAND = {"type": "band_limited", "correlation_s": 0.5}
+
+
+DRAWINGS: dict[str, Callable[[Figure], None]] = {
+    "slip": draw_slip,
+    "grip": draw_grip,
+    "floor": draw_floor,
+    "motors": draw_motors,
+    "sensors": draw_sensors,
+    "robots": draw_robots,
+}
 
 
 def under(**groups: dict[str, Any]) -> dict[str, Any]:
@@ -62,6 +74,23 @@ def loaded(mass_kg: float, behind_mm: float) -> dict[str, Any]:
     return under(
         payload={"mass_kg": mass_kg, "behind_mm": behind_mm, "inertia_kg_mm2": inertia_kg_mm2}
     )
+
+
+def jumping(most_mm: float) -> dict[str, Any]:
+    """Fixes whose offset is drawn anew every 5 s."""
+    drawn = {"type": "uniform", "low": -most_mm, "high": most_mm, "every_s": 5.0}
+    return under(position={"bias_x_mm": drawn, "bias_y_mm": drawn})
+
+
+def outage(duration_s: float) -> dict[str, Any]:
+    """No fixes for a while, after settling."""
+    gone = {"type": "impulse", "value": 1.0, "at_s": 30.0, "duration_s": duration_s}
+    return under(position={"outage": gone})
+
+
+def observed(bandwidth_rad_s: float) -> dict[str, Any]:
+    """Wheel speeds from a velocity observer."""
+    return {"wheel_loop": {"speed_observer_rad_s": bandwidth_rad_s}}
 
 
 def mixed() -> dict[str, Any]:
@@ -155,6 +184,32 @@ FAMILIES: dict[str, dict[str, dict[str, Any]]] = {
         "current limit × 0.9": under(actuator={"current_limit": 0.9}),
         "dead band 1 N·mm": under(actuator={"dead_band_Nmm": 1.0}),
         "dead band 3 N·mm": under(actuator={"dead_band_Nmm": 3.0}),
+    },
+    "sensors": {
+        "nominal": {},
+        "fixes without noise: `none`": preset("none"),
+        "noise of 2 mm: `noise`": preset("noise"),
+        "noise of 10 mm": under(position={"noise_std_mm": 10.0}),
+        "fixes that jump by up to 10 mm every 5 s": jumping(10.0),
+        "fixes at 100 Hz": under(position={"period_s": 0.01}),
+        "fixes at 30 Hz": under(position={"period_s": 0.033}),
+        "fixes at 10 Hz": under(position={"period_s": 0.1}),
+        "fixes 10 ms late": under(position={"delay_s": 0.01}),
+        "fixes 50 ms late": under(position={"delay_s": 0.05}),
+        "fixes at 30 Hz, 50 ms late": under(position={"period_s": 0.033, "delay_s": 0.05}),
+        "outage of 1 s at 30 s": outage(1.0),
+        "outage of 5 s at 30 s": outage(5.0),
+        "half of the fixes missing": under(position={"outage": 0.5}),
+        "5 % outliers of 50 mm": under(position={"outlier_share": 0.05, "outlier_std_mm": 50.0}),
+        "encoder noise of 0.0001 rad": under(encoder={"noise_std_rad": 1e-4}),
+        "encoders of 4096 counts": counts(4096),
+        "encoders of 4096 counts, velocity observer of 80 rad/s": counts(4096) | observed(80.0),
+        "encoders of 1024 counts": counts(1024),
+        "encoders of 1024 counts, velocity observer of 50 rad/s": counts(1024) | observed(50.0),
+        "velocity observer of 80 rad/s alone": observed(80.0),
+        "both radii 1 % too large": under(calibration={"radius_left": 1.01, "radius_right": 1.01}),
+        "left radius 0.5 % too large": under(calibration={"radius_left": 1.005}),
+        "axle 2 % too wide": under(calibration={"track": 1.02}),
     },
     "robots": {
         "nominal": {},
