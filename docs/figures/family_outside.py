@@ -184,7 +184,7 @@ def draw_grip(figure: Figure) -> None:
     slid = record["slip_mm_s"][late, 1] > 1.0
     floor.plot(x, y, lw=1.0, color="black", label="path")
     floor.plot(x[slid], y[slid], "o", ms=3, color="#D55E00", label="slips by 1 mm/s or more")
-    floor.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal", xlim=(-500, 8500))
+    floor.set(xlabel="x (mm)", ylabel="y (mm)", aspect="equal", xlim=(0, 10000))
     legend(floor, loc="center right")
 
 
