@@ -3,18 +3,16 @@
 from __future__ import annotations
 
 import functools
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
+from page_tables import numbers_in, rows_of
 
 from tlf_env.engine.formation import Formation
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.physics.parameters import RobotParameters
 from tlf_env.task.scenario import load_scenario
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "controller" / "slip-estimator.md"
 R, L = RobotParameters().wheel_radius_mm, RobotParameters().axle_width_mm
 FROM_MS, AFTER_MS = 3000, 1100
 TIMES_MS = (1, 4, 50, 1000)
@@ -72,25 +70,18 @@ def shown(case: str) -> np.ndarray:
     return -100.0 * (twist - twist[0]) / slip[axis]
 
 
-def page_rows() -> dict[str, list[float]]:
-    text = PAGE.read_text(encoding="utf-8")
-    inside = text.split("<!-- encoders -->")[1].split("<!-- end of encoders -->")[0]
-    rows = [line.strip("| ").split("|") for line in inside.strip().splitlines()[2:]]
-    return {
-        case.strip(): [float(re.sub("[ %]", "", one).replace("−", "-")) for one in cells]
-        for case, *cells in rows
-    }
+PAGE = rows_of("controller/slip-estimator.md", "encoders")
 
 
 def test_the_page_has_every_case():
-    assert list(page_rows()) == list(CASES)
+    assert list(PAGE) == list(CASES)
 
 
 @pytest.mark.parametrize("case", CASES)
 def test_share_of_a_slip_that_the_encoders_show(case):
     """To a percentage point, and the largest share at any time."""
     measured = shown(case)
-    quoted = page_rows()[case]
+    quoted = numbers_in(" ".join(PAGE[case]))
     np.testing.assert_allclose([*measured[list(TIMES_MS)], measured.max()], quoted, atol=1.0)
 
 

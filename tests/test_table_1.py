@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 import re
-from pathlib import Path
 
 import pytest
+from page_tables import DOCS, numbers_in, rows_of
 from physics_helpers import ICE, ROBOT, first, run
 
 from tlf_env.physics.parameters import FrictionCurve, JointFriction, RobotParameters
 
-PAGE = Path(__file__).resolve().parents[1] / "docs" / "physics.md"
 JOINTS = (ROBOT.drive_joint, ROBOT.castor_joint, ROBOT.steering_joint)
 
 
@@ -54,19 +53,10 @@ TABLE_I = {
 WITHOUT_COUNTERPART = ("inactive during static", *(one for one in TABLE_I if "impact" in one))
 
 
-def table() -> dict[str, tuple[str, str]]:
+def table() -> dict[str, list[str]]:
     """The page's rows: by entry, without its symbol, what is printed and what it is here."""
-    text = PAGE.read_text(encoding="utf-8")
-    inside = text.split("<!-- table 1 -->")[1].split("<!-- end of table 1 -->")[0]
-    rows = [line.strip("|").split("|") for line in inside.strip().splitlines()[2:]]
-    return {
-        re.sub(r" \$.*\$", "", entry.strip()): (printed.strip(), here.strip())
-        for entry, printed, here in rows
-    }
-
-
-def numbers(text: str) -> tuple[float, ...]:
-    return tuple(float(one) for one in re.findall(r"(?<![\w.])\d+(?:\.\d+)?", text))
+    rows = rows_of("physics.md", "table 1")
+    return {re.sub(r" \$.*\$", "", entry): cells for entry, cells in rows.items()}
 
 
 def test_the_page_names_every_entry_in_the_papers_order():
@@ -81,7 +71,7 @@ def test_a_printed_value_is_the_default_or_has_no_counterpart(entry):
     if isinstance(value, str):
         assert printed == value
     else:
-        assert numbers(printed) == pytest.approx(value, rel=1e-12)
+        assert numbers_in(printed) == pytest.approx(value, rel=1e-12)
 
 
 def test_the_page_names_fields_that_exist():
@@ -117,7 +107,7 @@ def test_a_preload_above_0_acts():
 def test_what_the_papers_contact_stiffness_would_do():
     """The page's figures, from its rows: ADAMS's impact force k·pᵉ + c·ṗ under the constant loads."""
     (k,), (e,), (c,) = (
-        numbers(table()[f"impact: {name}"][0])
+        numbers_in(table()[f"impact: {name}"][0])
         for name in ("stiffness", "force exponent", "damping")
     )
     weight_N = ROBOT.mass_kg * ROBOT.gravity_mm_s2 / 1000
@@ -130,7 +120,9 @@ def test_what_the_papers_contact_stiffness_would_do():
     damping = 3 * c * 1000 / (2 * math.sqrt(slope * ROBOT.mass_kg))
     slowest_s = 1 / (rate * (damping - math.sqrt(damping**2 - 1)))
     base_mm = ROBOT.castor_pivot_mm + ROBOT.castor_trail_mm
-    text = " ".join(PAGE.read_text(encoding="utf-8").split("**Contact stiffness.**")[1].split())
+    text = " ".join(
+        (DOCS / "physics.md").read_text(encoding="utf-8").split("**Contact stiffness.**")[1].split()
+    )
     for said in (
         f"sink in by {drive:.2f} mm (drive wheels) and {castor:.2f} mm (castor)",
         f"pitches the robot by {(drive - castor) / base_mm:.3f} rad",
