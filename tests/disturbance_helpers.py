@@ -36,6 +36,9 @@ FIX = [Sample._fields.index("fix_x"), Sample._fields.index("fix_y")]
 STEPS = [Sample._fields.index("step_l"), Sample._fields.index("step_r")]
 
 
+GYRO = Sample._fields.index("gyro")
+
+
 ANGLES = [11, 12]  # of Motion
 
 
@@ -74,6 +77,17 @@ SHOWS = {
     "actuator.back_emf_s_rad": 0.05,
     "actuator.dead_band_Nmm": 1.0,
     "actuator.current_limit": 0.8,
+    "position.period_s": 0.01,
+    "position.delay_s": 0.02,
+    "position.outage": 0.3,
+    "position.outlier_share": 0.1,
+    "position.outlier_std_mm": 5.0,
+    "gyro.bias_rad_s": 0.01,
+    "gyro.scale": 1.1,
+    "gyro.noise_rad_s_sqrt_hz": 1e-4,
+    "calibration.radius_left": 1.01,
+    "calibration.radius_right": 1.01,
+    "calibration.track": 1.01,
 }
 
 
@@ -82,6 +96,8 @@ NEEDS = {
     "payload.behind_mm": {"payload.mass_kg": 0.5},
     "payload.inertia_kg_mm2": {"payload.mass_kg": 0.5},
     "floor.uphill_rad": {"floor.slope_rad": 0.02},
+    "position.outlier_share": {"position.outlier_std_mm": 5.0},
+    "position.outlier_std_mm": {"position.outlier_share": 0.1},
 }
 
 
@@ -126,6 +142,7 @@ class Run:
                     "applied": formation.applied().copy(),
                     "fix": a.samples[-1, FIX, :, 0].T - c,
                     "turned": a.samples[..., 0].sum(axis=0)[STEPS].T,
+                    "gyro": a.samples[:, GYRO, :, 0].copy(),
                     "dropped": a.dropped[formation.step_count % len(a.dropped), :, 0].copy(),
                     "message": a.messages[:, formation.step_count % len(a.dropped), :, 0].T.copy(),
                     "info": a.infos[0].copy(),

@@ -50,7 +50,12 @@ def test_away_from_nominal_the_run_changes(path):
     beside = NEEDS.get(path, {})
     before = run(beside) if beside else nominal()
     after = run({**beside, path: SHOWS[path]})
-    assert (after.motion[-1] != before.motion[-1]).any()
+    if path.startswith("gyro."):  # no part of the reference reads it
+        assert (after.gyro != before.gyro).any()
+        assert (after.motion == before.motion).all()
+    else:
+        assert (after.motion[-1] != before.motion[-1]).any()
+        assert (after.gyro != before.gyro).any()
     assert (after.applied[:, :, number(path)] == SHOWS[path]).all()
 
 
@@ -115,6 +120,31 @@ FIXED = {
     "payload.inertia_kg_mm2": (116, 0.0),
     "start.position_std_mm": (117, 0.0),
     "start.heading_std_rad": (118, 0.0),
+    "slip.left_mm_s": (119, 0.0),
+    "slip.right_mm_s": (120, 0.0),
+    "tyre.friction_left": (121, 1.0),
+    "tyre.friction_right": (122, 1.0),
+    "tyre.creep": (123, 0.0),
+    "floor.rolling_resistance": (124, 0.0),
+    "floor.slope_rad": (125, 0.0),
+    "floor.uphill_rad": (126, 0.0),
+    "push.x_N": (127, 0.0),
+    "push.y_N": (128, 0.0),
+    "push.torque_Nmm": (129, 0.0),
+    "actuator.back_emf_s_rad": (130, 0.0),
+    "actuator.dead_band_Nmm": (131, 0.0),
+    "actuator.current_limit": (132, 1.0),
+    "position.period_s": (133, 0.0),
+    "position.delay_s": (134, 0.0),
+    "position.outage": (135, 0.0),
+    "position.outlier_share": (136, 0.0),
+    "position.outlier_std_mm": (137, 0.0),
+    "gyro.bias_rad_s": (138, 0.0),
+    "gyro.scale": (139, 1.0),
+    "gyro.noise_rad_s_sqrt_hz": (140, 0.0),
+    "calibration.radius_left": (141, 1.0),
+    "calibration.radius_right": (142, 1.0),
+    "calibration.track": (143, 1.0),
 }
 
 

@@ -12,6 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import tlf_env
+from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.tracking import (
     body_errors,
@@ -27,6 +28,7 @@ from tlf_env.task.actions import TWIST, WHEEL_SPEED, wheel_command
 
 PRESETS = ("consistent", "printed")
 BODY = body(RobotParameters())
+BELIEF = Belief(radius_l=1.0, radius_r=1.0, h=BODY.h)
 R_MM, L_MM = 50.0, 156.0  # Table I
 EQ_1 = np.array([[R_MM / 2, R_MM / 2], [-R_MM / L_MM, R_MM / L_MM]])  # from (ω_l, ω_r)
 
@@ -291,12 +293,12 @@ def test_error_rates_on_the_kinematic_plant_are_eq_17():
 @untimed
 @given(st.floats(-1, 1), st.floats(-1, 1))
 def test_twist_command_inverts_eq_1(forward, turn):
-    wheels = wheel_command(forward, turn, TWIST, BODY)
+    wheels = wheel_command(forward, turn, TWIST, BODY, BELIEF)
     np.testing.assert_allclose(EQ_1 @ wheels, (1000 * forward, 8 * turn), rtol=1e-12, atol=1e-12)
 
 
 def test_wheel_speed_command_is_in_units_of_25_rad_s():
-    assert wheel_command(0.5, -1.0, WHEEL_SPEED, BODY) == (12.5, -25.0)
+    assert wheel_command(0.5, -1.0, WHEEL_SPEED, BODY, BELIEF) == (12.5, -25.0)
 
 
 # Closed loop

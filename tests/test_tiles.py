@@ -12,8 +12,16 @@ from tlf_env.engine.arrays import Arrays, make_arrays, make_variants
 from tlf_env.engine.effects import evaluate
 from tlf_env.engine.excerpt import empty_excerpt
 from tlf_env.engine.formation import reference_table
-from tlf_env.engine.layout import Draw, Order, Sample, array_reader, array_writer
-from tlf_env.engine.sensors import disturbed_encoders, sense_robot
+from tlf_env.engine.layout import (
+    Draw,
+    Order,
+    Sample,
+    WheelPair,
+    YawRate,
+    array_reader,
+    array_writer,
+)
+from tlf_env.engine.sensors import disturbed_encoders, measured_fix, sense_robot
 from tlf_env.engine.settings import Settings, make_settings
 from tlf_env.engine.substeps import commanded_torques, floor_under, trace_drive, undisturbed
 from tlf_env.engine.tiles import WIDTH, advance
@@ -120,6 +128,8 @@ read_estimate, write_estimate = array_reader("estimate"), array_writer("estimate
 read_slip, write_slip = array_reader("slip"), array_writer("slip")
 read_trace, write_trace = array_reader("trace"), array_writer("trace")
 read_command = array_reader("command")
+read_belief = array_reader("belief")
+write_commanded = array_writer("commanded")
 
 
 @driver
@@ -136,7 +146,7 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                 read_slip_ekf(a.constants, r, lane),
             )
             wanted_l, wanted_r = read_command(a.states, r, lane)
-            order = Order(float(TWIST), wanted_l, wanted_r, 0.0, 0.0, 0.0, 0.0)
+            order = Order(float(TWIST), wanted_l, wanted_r, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
             for k in range(s.substeps):
                 tick = a.clock[lane, 0] + k
                 if s.changing:
@@ -167,16 +177,18 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                 draw = Draw(a.seeds[lane], r, a.clock[lane, 2], tick + 1)
                 sensors, estimate, slip, trace, sample = sense_robot(
                     body,
+                    read_belief(a.constants, r, lane),
                     ekf,
                     slip_ekf,
-                    effects,
                     motion,
                     disturbed_encoders(motion, effects, draw),
+                    measured_fix(body, motion, effects, draw),
+                    YawRate(motion.w),
+                    WheelPair(commanded_l, commanded_r),
                     sensors,
                     read_estimate(a.states, r, lane),
                     read_slip(a.states, r, lane),
                     trace,
-                    draw,
                     order,
                     k,
                     s.estimator,
@@ -185,6 +197,7 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                 write_motion(a.states, r, lane, motion)
                 write_contact(a.states, r, lane, contact)
                 write_loop_state(a.states, r, lane, held)
+                write_commanded(a.states, r, lane, WheelPair(commanded_l, commanded_r))
                 write_sensors(a.states, r, lane, sensors)
                 write_estimate(a.states, r, lane, estimate)
                 write_slip(a.states, r, lane, slip)

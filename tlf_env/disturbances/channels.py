@@ -19,6 +19,9 @@ RADIO_DROPOUT = 5
 MIXTURE = 6
 MOVING_OBSTACLE = 7
 RAYS = 8
+POSITION_OUTAGE = 9
+POSITION_OUTLIER = 10
+GYRO_NOISE = 11
 
 Rate = Literal["substep", "control step", "episode"]
 SUBSTEP: Rate = "substep"  # acts in the plant and the sensors, so it is evaluated in every substep
@@ -90,6 +93,17 @@ CHANNELS = (
     Channel("actuator.back_emf_s_rad", 130, SUBSTEP, 0.0, (0.0, 1.0), "share of torque lost per rad/s"),
     Channel("actuator.dead_band_Nmm", 131, SUBSTEP, 0.0, (0.0, 1000.0), "smaller torques are not delivered"),
     Channel("actuator.current_limit", 132, SUBSTEP, 1.0, (0.0, 10.0), "factor on the torque limit delivered"),
+    Channel("position.period_s", 133, EPISODE, 0.0, (0.0, 1.0), "between fixes; 0: one in every physics step"),
+    Channel("position.delay_s", 134, EPISODE, 0.0, (0.0, 0.5), "age of a fix when it arrives"),
+    Channel("position.outage", 135, SUBSTEP, 0.0, (0.0, 1.0), "share of the fixes that are missing"),
+    Channel("position.outlier_share", 136, SUBSTEP, 0.0, (0.0, 1.0), "share of the fixes that are outliers"),
+    Channel("position.outlier_std_mm", 137, SUBSTEP, 0.0, (0.0, 1e4), "further error of an outlier"),
+    Channel("gyro.bias_rad_s", 138, SUBSTEP, 0.0, (-10.0, 10.0), "offset of the gyro"),
+    Channel("gyro.scale", 139, SUBSTEP, 1.0, (0.0, 2.0), "measured over true yaw rate"),
+    Channel("gyro.noise_rad_s_sqrt_hz", 140, SUBSTEP, 0.0, (0.0, 1.0), "density of the gyro's white noise"),
+    Channel("calibration.radius_left", 141, EPISODE, 1.0, (0.5, 2.0), "believed over true radius, left"),
+    Channel("calibration.radius_right", 142, EPISODE, 1.0, (0.5, 2.0), "believed over true radius, right"),
+    Channel("calibration.track", 143, EPISODE, 1.0, (0.5, 2.0), "believed over true width of the axle"),
 )  # fmt: skip
 
 
@@ -120,6 +134,12 @@ class Effects(NamedTuple):
     actuator_back_emf_s_rad: float
     actuator_dead_band_Nmm: float
     actuator_current_limit: float
+    position_outage: float
+    position_outlier_share: float
+    position_outlier_std_mm: float
+    gyro_bias_rad_s: float
+    gyro_scale: float
+    gyro_noise_rad_s_sqrt_hz: float
 
 
 PATHS = tuple(channel.path for channel in CHANNELS)
@@ -166,3 +186,8 @@ PAYLOAD_BEHIND = number("payload.behind_mm")
 PAYLOAD_INERTIA = number("payload.inertia_kg_mm2")
 START_POSITION = number("start.position_std_mm")
 START_HEADING = number("start.heading_std_rad")
+FIX_PERIOD = number("position.period_s")
+FIX_DELAY = number("position.delay_s")
+RADIUS_LEFT = number("calibration.radius_left")
+RADIUS_RIGHT = number("calibration.radius_right")
+TRACK = number("calibration.track")

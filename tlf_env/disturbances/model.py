@@ -78,6 +78,11 @@ class PositionChannels(Frozen):
     bias_x_mm: ChannelSignal = _nominal("position.bias_x_mm")
     bias_y_mm: ChannelSignal = _nominal("position.bias_y_mm")
     noise_std_mm: ChannelSignal = _nominal("position.noise_std_mm")
+    period_s: ChannelSignal = _nominal("position.period_s")
+    delay_s: ChannelSignal = _nominal("position.delay_s")
+    outage: ChannelSignal = _nominal("position.outage")
+    outlier_share: ChannelSignal = _nominal("position.outlier_share")
+    outlier_std_mm: ChannelSignal = _nominal("position.outlier_std_mm")
 
 
 class EncoderChannels(Frozen):
@@ -85,6 +90,22 @@ class EncoderChannels(Frozen):
 
     noise_std_rad: ChannelSignal = _nominal("encoder.noise_std_rad")
     quantum_rad: ChannelSignal = _nominal("encoder.quantum_rad")
+
+
+class GyroChannels(Frozen):
+    """A gyro that measures the yaw rate."""
+
+    bias_rad_s: ChannelSignal = _nominal("gyro.bias_rad_s")
+    scale: ChannelSignal = _nominal("gyro.scale")
+    noise_rad_s_sqrt_hz: ChannelSignal = _nominal("gyro.noise_rad_s_sqrt_hz")
+
+
+class CalibrationChannels(Frozen):
+    """What a robot's computer believes of its wheels, over the truth."""
+
+    radius_left: ChannelSignal = _nominal("calibration.radius_left")
+    radius_right: ChannelSignal = _nominal("calibration.radius_right")
+    track: ChannelSignal = _nominal("calibration.track")
 
 
 class ActuatorChannels(Frozen):
@@ -132,6 +153,8 @@ class Disturbance(Frozen):
     push: PushChannels = PushChannels()
     position: PositionChannels = PositionChannels()
     encoder: EncoderChannels = EncoderChannels()
+    gyro: GyroChannels = GyroChannels()
+    calibration: CalibrationChannels = CalibrationChannels()
     actuator: ActuatorChannels = ActuatorChannels()
     radio: RadioChannels = RadioChannels()
     payload: PayloadChannels = PayloadChannels()

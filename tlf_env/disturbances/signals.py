@@ -12,6 +12,7 @@ from tlf_env.numerics.compiled import law
 from tlf_env.numerics.philox import normal_pair, unit, words
 
 CONSTANT, STEP, IMPULSE, SINE, UNIFORM, GAUSSIAN, ORNSTEIN_UHLENBECK, BAND_LIMITED = range(8)
+RANDOM_WALK = 8
 # Of a cubic B-spline with independent coefficients of unit variance: the standard deviation, and the lag at
 # which its autocorrelation (a B-spline of degree 7) is 1/e, in distances between coefficients.
 SPLINE_STD = math.sqrt(151.0 / 315.0)
@@ -248,8 +249,37 @@ class BandLimited(_Signal):
         return mean - TAILS * self.std, mean + TAILS * self.std
 
 
+class RandomWalk(_Signal):
+    """Sum of independent Gaussian steps: its standard deviation is ``per_sqrt_s`` · √t after t s.
+
+    It has no bound, so it is clamped at the ends of the channel's range.
+    """
+
+    type: Literal["random_walk"] = "random_walk"
+    per_sqrt_s: NonNegative
+    start: Number | None = None  # None: the channel's nominal value
+
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
+        """See :class:`SignalRow`."""
+        step = self.per_sqrt_s * math.sqrt(period_s)
+        return SignalRow(RANDOM_WALK, _or(self.start, nominal), step, 0.0, 0.0)
+
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
+        """Its start."""
+        start = _or(self.start, nominal)
+        return start, start
+
+
 Signal = Annotated[
-    Constant | Step | Impulse | Sine | Uniform | Gaussian | OrnsteinUhlenbeck | BandLimited,
+    Constant
+    | Step
+    | Impulse
+    | Sine
+    | Uniform
+    | Gaussian
+    | OrnsteinUhlenbeck
+    | BandLimited
+    | RandomWalk,
     Field(discriminator="type"),
 ]
 
@@ -304,7 +334,10 @@ def signal_value(
     episode: int,
     memory: float,
 ) -> tuple[float, float]:
-    """A signal's value at a tick, and what an Ornstein–Uhlenbeck process remembers (unit variance)."""
+    """A signal's value at a tick, and the memory of a random process.
+
+    An Ornstein–Uhlenbeck process has unit variance there, a random walk unit steps.
+    """
     kind = int(row.kind)
     if kind == CONSTANT:
         return row.a, memory
@@ -328,6 +361,11 @@ def signal_value(
             memory = drawn
         else:
             memory = row.c * memory + math.sqrt(1.0 - row.c * row.c) * drawn
+        return row.a + row.b * memory, memory
+    if kind == RANDOM_WALK:
+        drawn, _ = normal_pair(seed, channel, robot, episode, tick)
+        if tick > 0:
+            memory += drawn
         return row.a + row.b * memory, memory
     index = tick // int(row.every) if row.every > 0.0 else 0
     value = random_draw(row, index, seed, channel, robot, episode)

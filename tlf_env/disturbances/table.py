@@ -13,6 +13,7 @@ from tlf_env.disturbances.channels import CHANNELS, Channel
 
 # Endings of a name, the longest first, and their units.
 UNITS = {
+    "_rad_s_sqrt_hz": "rad/s/√Hz",
     "_kg_mm2": "kg·mm²",
     "_s_rad": "s/rad",
     "_per_s": "1/s",

@@ -8,12 +8,13 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tlf_env.disturbances.channels import CHANNELS, DEAD_TIME, JITTER
+from tlf_env.disturbances.channels import CHANNELS, DEAD_TIME, EPISODE, FIX_DELAY, JITTER
 from tlf_env.disturbances.model import PatchRow, leveled, patch_rows, signal_rows
 from tlf_env.engine.layout import (
     BY_NAME,
     CONSTANT_FIELDS,
     ROWS,
+    Fix,
     Kind,
     Sample,
     Traction,
@@ -23,9 +24,11 @@ from tlf_env.engine.layout import (
     rows_of,
 )
 from tlf_env.numerics.rows import reader, writer
+from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.estimator import ekf_constants
 from tlf_env.onboard.observer import Message, Reference
 from tlf_env.onboard.slip_estimator import slip_ekf_constants
+from tlf_env.onboard.speed_observer import speed_observer_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters, digital_wheel_loop
 from tlf_env.physics.vehicle import Floor, Push, body
 from tlf_env.physics.world import capsule_rows
@@ -71,7 +74,7 @@ class Arrays(NamedTuple):
     levels: np.ndarray  # (lane,) of the disturbance
     # what changes
     states: np.ndarray  # the rows of kind STATE, then those of kind CONTROL
-    processes: np.ndarray  # (channel, robot, lane): memory of Ornstein–Uhlenbeck signals
+    processes: np.ndarray  # (channel, robot, lane): memory of random processes
     applied: np.ndarray  # (channel, robot, lane): the channels' values, last evaluated
     imposed: np.ndarray  # (channel, robot, lane): values set by an adversary, else NaN
     torques: np.ndarray  # (wheel, slot, robot, lane): ring over the longest dead time, mN·mm
@@ -80,6 +83,7 @@ class Arrays(NamedTuple):
         np.ndarray
     )  # (Traction and Floor, robot, lane) of a substep on plant `chipmunk`, else empty
     samples: np.ndarray  # (substep, Sample, robot, lane): sensor readings of a control step
+    fixes: np.ndarray  # (Fix, slot, robot, lane): ring over the longest delay of the fixes
     dropped: np.ndarray  # (slot, robot, lane) bool: whether that broadcast was lost
     messages: np.ndarray  # (Message, slot, robot, lane): ring over one gap
     references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
@@ -129,6 +133,8 @@ FLOOR_INPUT = len(Traction._fields)
 PUSH_INPUT = FLOOR_INPUT + len(Floor._fields)
 
 read_body = array_reader("body")
+read_belief, write_belief = array_reader("belief"), array_writer("belief")
+read_slip_ekf, write_slip_ekf = array_reader("slip_ekf"), array_writer("slip_ekf")
 read_motion, write_motion = array_reader("motion"), array_writer("motion")
 read_estimate, write_estimate = array_reader("estimate"), array_writer("estimate")
 read_slip = array_reader("slip")
@@ -151,11 +157,16 @@ def constant_rows(scenario: Scenario) -> dict[str, Sequence[tuple[float, ...]]]:
     if isinstance(loop, str):  # an object outside; the engine's own loop is not used
         loop = WheelLoopParameters()
     robots, dt_s = scenario.robot_models, scenario.physics_period_s
+    bodies = [body(robot) for robot in robots]
     return {
-        "body": [body(robot) for robot in robots],
+        "body": bodies,
         "wheel_loop": [digital_wheel_loop(loop, dt_s)] * len(robots),
         "ekf": [ekf_constants(scenario.ekf)] * len(robots),
         "slip_ekf": [slip_ekf_constants(scenario.ekf_slip, dt_s)] * len(robots),
+        "belief": [Belief(radius_l=1.0, radius_r=1.0, h=one.h) for one in bodies],
+        "speed_observer": [
+            speed_observer_row(loop.speed_observer_rad_s, one, dt_s) for one in bodies
+        ],
     }
 
 
@@ -177,7 +188,7 @@ def _all_patches(scenarios: Sequence[Scenario]) -> np.ndarray:
 
 def longest(scenario: Scenario, channel: int) -> float:
     """The largest value that a channel can have; its range's end if an adversary may set it."""
-    if scenario.adversary:
+    if scenario.adversary and CHANNELS[channel].rate != EPISODE:
         return CHANNELS[channel].high
     reach = scenario.disturbance.signal(CHANNELS[channel].path).reach(CHANNELS[channel].nominal)
     level = scenario.disturbance.level
@@ -227,6 +238,7 @@ def make_arrays(
     lookahead = max(scenario.preview_steps, default=0)
 
     dead = max(round(longest(one, DEAD_TIME) / one.physics_period_s) for one in scenarios)
+    old = max(round(longest(one, FIX_DELAY) / one.physics_period_s) for one in scenarios)
     late = max(math.ceil(longest(one, JITTER) / one.control_period_s) for one in scenarios)
     ring = gap + 1 + late
     columns = padded(lanes)
@@ -259,6 +271,7 @@ def make_arrays(
         kinds=np.full((robots, columns), ACTION_KINDS[scenario.action], dtype=np.int64),
         inputs=zeros(PUSH_INPUT + len(Push._fields) if scenario.plant == "chipmunk" else 0),
         samples=np.zeros((scenario.substeps, len(Sample._fields), robots, columns)),
+        fixes=np.zeros((len(Fix._fields), old + 1, robots, columns)),
         dropped=np.zeros((ring, robots, columns), dtype=np.bool_),
         messages=np.zeros((len(Message._fields), ring, robots, columns)),
         references=np.zeros((len(Reference._fields), lookahead + 1, robots, columns)),

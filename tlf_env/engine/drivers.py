@@ -13,6 +13,7 @@ import numpy as np
 from tlf_env.engine.arrays import (
     Arrays,
     Variants,
+    read_belief,
     read_body,
     read_contact,
     read_motion,
@@ -79,6 +80,7 @@ def command(arrays: Arrays, lane: int, robot: int, settings: Settings) -> tuple[
         full = FULL_TORQUE_NMM * MILLINEWTON_PER_NEWTON
         return a_0 * full, a_1 * full
     body = read_body(arrays.constants, robot, lane)
+    belief = read_belief(arrays.constants, robot, lane)
     if kind == RESIDUAL:
         seen, given = arrays.observations[lane, robot], arrays.twists[lane, robot]
         u_1, u_2 = wanted_twist(seen, arrays.scales, settings.base)
@@ -86,8 +88,8 @@ def command(arrays: Arrays, lane: int, robot: int, settings: Settings) -> tuple[
         u_1 += share * a_0 * FULL_RESIDUAL_MM_S
         u_2 += share * a_1 * FULL_RESIDUAL_RAD_S
         given[0], given[1] = twist_action(seen, arrays.scales, settings.base, u_1, u_2)
-        return wheel_command(given[0], given[1], TWIST, body)
-    return wheel_command(a_0, a_1, kind, body)
+        return wheel_command(given[0], given[1], TWIST, body, belief)
+    return wheel_command(a_0, a_1, kind, body, belief)
 
 
 @block

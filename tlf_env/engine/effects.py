@@ -9,6 +9,8 @@ from tlf_env.disturbances.channels import (
     COMPUTING_DELAY,
     CONTROL_STEP,
     DEAD_TIME,
+    FIX_DELAY,
+    FIX_PERIOD,
     SUBSTEP,
     numbers,
 )
@@ -87,3 +89,10 @@ def delays(arrays: Arrays, lane: int, robot: int, dt: float) -> tuple[int, int]:
     """Dead time of the torques, and for how long the last action still holds, in ticks."""
     dead = round(arrays.applied[DEAD_TIME, robot, lane] / dt)
     return dead, round(arrays.applied[COMPUTING_DELAY, robot, lane] / dt)
+
+
+@law
+def fix_timing(arrays: Arrays, lane: int, robot: int, dt: float) -> tuple[int, int]:
+    """Ticks from a position fix to the next, at least 1, and from its measurement to its arrival."""
+    every = max(round(arrays.applied[FIX_PERIOD, robot, lane] / dt), 1)
+    return every, round(arrays.applied[FIX_DELAY, robot, lane] / dt)

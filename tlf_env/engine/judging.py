@@ -8,6 +8,7 @@ import numpy as np
 
 from tlf_env.engine.arrays import (
     Arrays,
+    read_belief,
     read_body,
     read_estimate,
     read_motion,
@@ -21,14 +22,22 @@ from tlf_env.engine.radio import delayed_message, latest_message, read_reference
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
+from tlf_env.onboard.calibration import believed_odometry
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.tracking import body_errors
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
-from tlf_env.physics.vehicle import axle_midpoint, odometry
+from tlf_env.physics.vehicle import axle_midpoint
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.info import HORIZON, LOST, OTHER_ROBOT, RUNNING, TOUCHED, Info
 from tlf_env.task.measures import distance, time_gap_error
-from tlf_env.task.observation import Preview, SensorTail, Tracking, preview_entries, scaled
+from tlf_env.task.observation import (
+    SAMPLE_ENTRIES,
+    Preview,
+    SensorTail,
+    Tracking,
+    preview_entries,
+    scaled,
+)
 from tlf_env.task.reward import reward_terms
 
 # For each EndReason, whether it is a failure of the robot itself, or cuts the episode off.
@@ -36,6 +45,7 @@ TERMINATES = (False, True, True, False, False)
 TRUNCATES = (False, False, False, True, True)
 CLIPPED = Info._fields.index("clipped")
 BODY_D = in_array("body", "d")
+SAMPLE_SIZE = len(SAMPLE_ENTRIES)  # the first fields of a Sample
 
 
 @law
@@ -49,12 +59,14 @@ def observe_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Se
     e_3 = reference.theta - estimate.theta
     sin_e3, cos_e3 = math.sin(e_3), math.cos(e_3)
     per_substep = 1.0 / settings.substeps
+    per_fix = 1.0 / max(trace.fixes, 1.0)
     to_Nmm = per_substep / MILLINEWTON_PER_NEWTON
     command_1 = command_2 = 0.0
     if arrays.kinds[robot, lane] != TORQUE:
         body = read_body(arrays.constants, robot, lane)
         wanted = read_wanted(arrays.states, robot, lane)
-        command_1, command_2 = odometry(wanted.left, wanted.right, body.R, body.h)
+        belief = read_belief(arrays.constants, robot, lane)
+        command_1, command_2 = believed_odometry(wanted.left, wanted.right, body, belief)
     before = Preview(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
     if robot > 0:
         received = latest_message(arrays, lane, robot, step, settings)
@@ -78,8 +90,8 @@ def observe_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Se
         last_action_1=arrays.last_actions[lane, robot, 1],
         command_u_1=command_1,
         command_u_2=command_2,
-        innovation_forward=trace.innovation_forward * per_substep,
-        innovation_right=trace.innovation_right * per_substep,
+        innovation_forward=trace.innovation_forward * per_fix,
+        innovation_right=trace.innovation_right * per_fix,
         slip_1=slip.delta_1,
         slip_2=slip.delta_2,
         torque_l=trace.torque_l * to_Nmm,
@@ -111,7 +123,7 @@ def observe_sensors(arrays: Arrays, lane: int, robot: int, step: int, settings: 
     start_x, start_y, start = read_start(arrays.states, robot, lane)
     i = 0
     for substep in range(settings.substeps):
-        for f in range(arrays.samples.shape[1]):
+        for f in range(SAMPLE_SIZE):
             value = arrays.samples[substep, f, robot, lane] if step > 0 else 0.0
             if step > 0 and f == 0:
                 value -= start_x
@@ -207,7 +219,7 @@ def judge_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Sett
         energy_mJ=trace.work / MILLINEWTON_PER_NEWTON,
         slid_mm=trace.slid,
         saturation_fraction=trace.saturated / settings.substeps,
-        innovation_nis=trace.nis / settings.substeps,
+        innovation_nis=trace.nis / max(trace.fixes, 1.0),
         x_mm=x,
         y_mm=y,
         theta_rad=motion.theta,

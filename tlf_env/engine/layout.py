@@ -17,19 +17,37 @@ import numpy as np
 
 from tlf_env.disturbances.channels import Effects
 from tlf_env.numerics.rows import reader, row_reader, row_writer, writer
+from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.estimator import Ekf, Estimate
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
+from tlf_env.onboard.speed_observer import SpeedObserverRow, SpeedObserverState
 from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState
 from tlf_env.physics.vehicle import Body, Contact, Motion, Push
 
 
 class Sensors(NamedTuple):
-    """Last encoder readings (rad) and the wheel speeds that follow from them (rad/s)."""
+    """Last encoder readings (rad), the wheel speeds that follow from them (rad/s), and the estimator's way.
+
+    The way is the sum of the motions by which the estimator moved its position (mm), without corrections.
+    """
 
     encoder_l: float
     encoder_r: float
     speed_l: float
     speed_r: float
+    way_x: float
+    way_y: float
+
+
+class Fix(NamedTuple):
+    """Position fix of a substep."""
+
+    x: float  # mm
+    y: float
+    here: float  # 1 if one has come, else 0
+    age: float  # s
+    way_x: float  # the estimator's way when it was measured, mm
+    way_y: float
 
 
 class Trace(NamedTuple):
@@ -42,6 +60,7 @@ class Trace(NamedTuple):
     innovation_forward: float  # sums of the EKF's innovation in estimated body axes, mm
     innovation_right: float
     nis: float  # sum of the normalised innovation squared
+    fixes: float  # number of position fixes
     torque_l: float  # sums, mN·mm
     torque_r: float
     saturated: float  # substeps with a torque at its limit
@@ -67,12 +86,17 @@ class Pose(NamedTuple):
 
 
 class Sample(NamedTuple):
-    """Sensor readings of one substep: position fix (mm) and the wheels' angle increments (rad)."""
+    """Sensor readings of one substep."""
 
-    fix_x: float
+    fix_x: float  # last position fix, mm
     fix_y: float
-    step_l: float
+    step_l: float  # angle increments of the wheels, rad
     step_r: float
+    has_fix: float  # 1 if a fix has come in this substep, else 0
+    fix_age: float  # its age, s
+    gyro: float  # yaw rate, rad/s
+    torque_l: float  # commanded, within the motor's limit, mN·mm
+    torque_r: float
 
 
 class Order(NamedTuple):
@@ -85,6 +109,8 @@ class Order(NamedTuple):
     before_r: float
     hold: float
     dead: float  # dead time of the torques, substeps
+    fix_every: float  # substeps from a position fix to the next
+    fix_delay: float  # age of a fix when it comes, substeps
 
 
 class Traction(NamedTuple):
@@ -104,6 +130,12 @@ class Reading(NamedTuple):
 
     left: float
     right: float
+
+
+class YawRate(NamedTuple):
+    """What the gyro reads."""
+
+    reading: float  # rad/s
 
 
 class Draw(NamedTuple):
@@ -149,10 +181,14 @@ ROWS = (
     Row("wheel_loop", WheelLoopRow, Kind.CONSTANT),
     Row("ekf", Ekf, Kind.CONSTANT),
     Row("slip_ekf", SlipEkf, Kind.CONSTANT),
+    Row("belief", Belief, Kind.CONSTANT),
+    Row("speed_observer", SpeedObserverRow, Kind.CONSTANT),
     Row("motion", Motion, Kind.STATE),
     Row("contact", Contact, Kind.STATE),
     Row("loop_state", WheelLoopState, Kind.STATE),
     Row("sensors", Sensors, Kind.STATE),
+    Row("observed_speed", SpeedObserverState, Kind.STATE),
+    Row("commanded", WheelPair, Kind.STATE),  # torques within the motors' limits
     Row("estimate", Estimate, Kind.STATE),
     Row("slip", SlipEstimate, Kind.STATE),
     Row("trace", Trace, Kind.STATE),
@@ -167,6 +203,8 @@ ROWS = (
     Row("traction", Traction, Kind.SCRATCH),
     Row("push", Push, Kind.SCRATCH),
     Row("reading", Reading, Kind.SCRATCH),
+    Row("fix", Fix, Kind.SCRATCH),
+    Row("yaw_rate", YawRate, Kind.SCRATCH),
     Row("moved", Motion, Kind.SCRATCH),  # as the plant leaves it, before the pose is advanced
     Row("impulses", Contact, Kind.SCRATCH),
     Row("draw", Draw, Kind.SCRATCH),

@@ -1,4 +1,4 @@
-"""The laws of a substep after the plant: encoders, position fixes and estimators, and their sums."""
+"""The laws of a substep after the plant: encoders, gyro, position fixes and estimators, and their sums."""
 
 from __future__ import annotations
 
@@ -6,24 +6,31 @@ import numpy as np
 
 from tlf_env.disturbances.channels import (
     ENCODER_NOISE,
+    GYRO_NOISE,
     POSITION_NOISE,
+    POSITION_OUTAGE,
+    POSITION_OUTLIER,
     Effects,
     effects_of_group,
     nominal_effects,
 )
 from tlf_env.engine.layout import (
     Draw,
+    Fix,
     Order,
     Reading,
     Sample,
     Sensors,
     Trace,
+    WheelPair,
+    YawRate,
     in_tile,
 )
 from tlf_env.engine.substeps import EXTERNAL_TORQUE, wanted
 from tlf_env.numerics.compiled import law
-from tlf_env.numerics.philox import normal_pair
+from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.numerics.rows import replacing
+from tlf_env.onboard.calibration import Belief, believed_odometry
 from tlf_env.onboard.estimator import Ekf, Estimate, correct, predict
 from tlf_env.onboard.kinds import EKF, EKF_SLIP, TRUTH
 from tlf_env.onboard.slip_estimator import (
@@ -36,14 +43,29 @@ from tlf_env.onboard.tracking import body_errors
 from tlf_env.physics.vehicle import Body, Motion, axle_midpoint, forward_and_yaw, odometry
 from tlf_env.task.actions import TORQUE
 
-# Encoders are exact while all of their channels are at their nominal values.
-ENCODER_EFFECTS = np.array([in_tile("effects", name) for name in effects_of_group("encoder")])
-NOMINAL_ENCODERS = np.array(
-    [getattr(nominal_effects(), name) for name in effects_of_group("encoder")]
+
+def of_group(group: str) -> tuple[np.ndarray, np.ndarray]:
+    """Places in a tile of a group's effects, and their nominal values."""
+    names = effects_of_group(group)
+    return (
+        np.array([in_tile("effects", name) for name in names]),
+        np.array([getattr(nominal_effects(), name) for name in names]),
+    )
+
+
+# Encoders and gyro are exact while all of their channels are at their nominal values, and every substep has a
+# position fix at once while all of these are.
+ENCODER_EFFECTS, NOMINAL_ENCODERS = of_group("encoder")
+GYRO_EFFECTS, NOMINAL_GYRO = of_group("gyro")
+FIX_NUMBERS = np.array(
+    [in_tile("order", "fix_every"), in_tile("order", "fix_delay")]
+    + [in_tile("effects", f"position_{name}") for name in ("outage", "outlier_share")]
 )
+NOMINAL_FIXES = np.array([1.0, 0.0, 0.0, 0.0])
 
 NO_SLIP = SlipEstimate(*(0.0 for _ in SlipEstimate._fields))
 with_slip = replacing(SlipEstimate, "delta_1", "delta_2")
+with_position = replacing(Fix, "x", "y")
 with_sensor_sums = replacing(
     Trace,
     "distance",
@@ -53,6 +75,7 @@ with_sensor_sums = replacing(
     "innovation_forward",
     "innovation_right",
     "nis",
+    "fixes",
 )
 
 
@@ -77,37 +100,18 @@ def disturbed_encoders(motion: Motion, effects: Effects, draw: Draw) -> Reading:
 
 
 @law
-def commanded_increments(
-    order: Order, body: Body, slip: SlipEstimate, substep: int, dt: float
-) -> tuple[float, float]:
-    """Commanded distance (mm) and turn (rad) of the wheels in a substep; the last ones with torques."""
-    if order.kind == TORQUE or order.kind == EXTERNAL_TORQUE:
-        return slip.u_1, slip.u_2
-    wanted_l, wanted_r = wanted(order, substep)
-    return odometry(wanted_l * dt, wanted_r * dt, body.R, body.h)
+def gyro_reading(motion: Motion, effects: Effects, draw: Draw, dt: float) -> float:
+    """Measured yaw rate (rad/s); white noise of density n has the standard deviation n/√dt."""
+    reading = effects.gyro_scale * motion.w + effects.gyro_bias_rad_s
+    if effects.gyro_noise_rad_s_sqrt_hz > 0.0:
+        noise, _ = normal_pair(draw.seed, GYRO_NOISE, draw.robot, draw.episode, draw.tick)
+        reading += effects.gyro_noise_rad_s_sqrt_hz / np.sqrt(dt) * noise
+    return reading
 
 
 @law
-def sense_robot(
-    body: Body,
-    ekf: Ekf,
-    slip_ekf: SlipEkf,
-    effects: Effects,
-    motion: Motion,
-    reading: Reading,
-    sensors: Sensors,
-    estimate: Estimate,
-    slip: SlipEstimate,
-    trace: Trace,
-    draw: Draw,
-    order: Order,
-    substep: int,
-    kind: int,
-    dt: float,
-) -> tuple[Sensors, Estimate, SlipEstimate, Trace, Sample]:
-    """Position fix and estimator (of the ``kind``) of one robot after a substep."""
-    step_l, step_r = reading.left - sensors.encoder_l, reading.right - sensors.encoder_r
-    u_1, u_2 = odometry(step_l, step_r, body.R, body.h)
+def measured_fix(body: Body, motion: Motion, effects: Effects, draw: Draw) -> Fix:
+    """A position fix with bias and noise, at once."""
     true_x, true_y = axle_midpoint(motion, body.d)
     x, y = true_x + effects.position_bias_x_mm, true_y + effects.position_bias_y_mm
     if effects.position_noise_std_mm > 0.0:
@@ -116,16 +120,93 @@ def sense_robot(
         )
         x += effects.position_noise_std_mm * noise_x
         y += effects.position_noise_std_mm * noise_y
+    return Fix(x=x, y=y, here=1.0, age=0.0, way_x=0.0, way_y=0.0)
+
+
+@law
+def missing(effects: Effects, order: Order, draw: Draw) -> bool:
+    """Whether no position is measured at a tick."""
+    if draw.tick % int(order.fix_every) != 0:
+        return True
+    if not effects.position_outage > 0.0:
+        return False
+    word, _, _, _ = words(draw.seed, POSITION_OUTAGE, draw.robot, draw.episode, draw.tick)
+    return unit(word) < effects.position_outage
+
+
+@law
+def with_outlier(fix: Fix, effects: Effects, draw: Draw) -> Fix:
+    """A position fix that may be an outlier."""
+    if not effects.position_outlier_share > 0.0:
+        return fix
+    chance, _, _, _ = words(draw.seed, POSITION_OUTLIER, draw.robot, draw.episode, 2 * draw.tick)
+    if unit(chance) >= effects.position_outlier_share:
+        return fix
+    far_x, far_y = normal_pair(
+        draw.seed, POSITION_OUTLIER, draw.robot, draw.episode, 2 * draw.tick + 1
+    )
+    std = effects.position_outlier_std_mm
+    return with_position(fix, fix.x + std * far_x, fix.y + std * far_y)
+
+
+@law
+def commanded_increments(
+    order: Order, body: Body, belief: Belief, slip: SlipEstimate, substep: int, dt: float
+) -> tuple[float, float]:
+    """Commanded distance (mm) and turn (rad) of the wheels in a substep; the last ones with torques."""
+    if order.kind == TORQUE or order.kind == EXTERNAL_TORQUE:
+        return slip.u_1, slip.u_2
+    wanted_l, wanted_r = wanted(order, substep)
+    return believed_odometry(wanted_l * dt, wanted_r * dt, body, belief)
+
+
+@law
+def sense_robot(
+    body: Body,
+    belief: Belief,
+    ekf: Ekf,
+    slip_ekf: SlipEkf,
+    motion: Motion,
+    reading: Reading,
+    fix: Fix,
+    yaw_rate: YawRate,
+    commanded: WheelPair,
+    sensors: Sensors,
+    estimate: Estimate,
+    slip: SlipEstimate,
+    trace: Trace,
+    order: Order,
+    substep: int,
+    kind: int,
+    dt: float,
+) -> tuple[Sensors, Estimate, SlipEstimate, Trace, Sample]:
+    """Wheel speeds and estimator (of the ``kind``) of one robot after a substep.
+
+    A fix that comes late is moved on by as much as the estimator moved its position since then.
+    """
+    step_l, step_r = reading.left - sensors.encoder_l, reading.right - sensors.encoder_r
+    u_1, u_2 = believed_odometry(step_l, step_r, body, belief)
+    way_x, way_y = sensors.way_x, sensors.way_y
     d_x = d_y = nis = 0.0
     if kind == EKF:
-        estimate, d_x, d_y, nis = correct(predict(estimate, ekf, u_1, u_2), ekf, x, y)
+        before_x, before_y = estimate.x, estimate.y
+        estimate = predict(estimate, ekf, u_1, u_2)
+        way_x, way_y = way_x + (estimate.x - before_x), way_y + (estimate.y - before_y)
+        x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
+        y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
+        estimate, d_x, d_y, nis = correct(estimate, ekf, x, y, fix.here)
     elif kind == EKF_SLIP:
-        commanded_1, commanded_2 = commanded_increments(order, body, slip, substep, dt)
+        before_x, before_y = estimate.x, estimate.y
+        commanded_1, commanded_2 = commanded_increments(order, body, belief, slip, substep, dt)
         estimate, slip = predict_with_slip(
             estimate, slip, slip_ekf, u_1, u_2, commanded_1, commanded_2, dt
         )
-        estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y)
+        way_x, way_y = way_x + (estimate.x - before_x), way_y + (estimate.y - before_y)
+        x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
+        y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
+        estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y, fix.here)
     elif kind == TRUTH:
+        true_x, true_y = axle_midpoint(motion, body.d)
         ahead, yaw = forward_and_yaw(motion)
         rolled, spun = odometry(motion.omega_l, motion.omega_r, body.R, body.h)
         slip = with_slip(NO_SLIP, ahead - rolled, yaw - spun)
@@ -142,7 +223,14 @@ def sense_robot(
         )
     forward, right = body_errors(d_x, d_y, estimate.theta)
     return (
-        Sensors(reading.left, reading.right, step_l / dt, step_r / dt),
+        Sensors(
+            encoder_l=reading.left,
+            encoder_r=reading.right,
+            speed_l=step_l / dt,
+            speed_r=step_r / dt,
+            way_x=way_x,
+            way_y=way_y,
+        ),
         estimate,
         slip,
         with_sensor_sums(
@@ -151,9 +239,20 @@ def sense_robot(
             trace.turn + u_2,
             trace.moved + u_1 - slip.spin_1 + slip.delta_1 * dt,
             trace.turned + u_2 - slip.spin_2 + slip.delta_2 * dt,
-            trace.innovation_forward + forward,
-            trace.innovation_right + right,
+            trace.innovation_forward + fix.here * forward,
+            trace.innovation_right + fix.here * right,
             trace.nis + nis,
+            trace.fixes + fix.here,
         ),
-        Sample(x, y, step_l, step_r),
+        Sample(
+            fix_x=fix.x,
+            fix_y=fix.y,
+            step_l=step_l,
+            step_r=step_r,
+            has_fix=fix.here,
+            fix_age=fix.age,
+            gyro=yaw_rate.reading,
+            torque_l=commanded.left,
+            torque_r=commanded.right,
+        ),
     )

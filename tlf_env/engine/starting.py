@@ -11,38 +11,48 @@ from tlf_env.disturbances.channels import (
     PAYLOAD_BEHIND,
     PAYLOAD_INERTIA,
     PAYLOAD_MASS,
+    RADIUS_LEFT,
+    RADIUS_RIGHT,
     START_HEADING,
     START_POSE,
     START_POSITION,
+    TRACK,
 )
 from tlf_env.engine.arrays import (
     Arrays,
     Variants,
+    read_belief,
     read_body,
     read_estimate,
     read_motion,
+    read_slip_ekf,
     read_start,
+    write_belief,
     write_estimate,
     write_motion,
     write_observer,
+    write_slip_ekf,
     write_start,
 )
-from tlf_env.engine.effects import evaluate_all
+from tlf_env.engine.effects import evaluate_all, fix_timing
 from tlf_env.engine.judging import BODY_D, CLIPPED, record_truth
-from tlf_env.engine.layout import Pose, in_array
+from tlf_env.engine.layout import Pose, Sample, in_array
 from tlf_env.engine.outlines import BODY_BEHIND, BODY_OUTLINE, radii
 from tlf_env.engine.radio import broadcast, next_reference
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.compiled import block, law
 from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.numerics.rows import replacing, writer
+from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.estimator import Estimate
+from tlf_env.onboard.slip_estimator import for_fixes
 from tlf_env.physics.vehicle import Mass, Motion, laden
 from tlf_env.physics.world import gap_to_walls
 from tlf_env.task.info import NOTHING
 from tlf_env.task.measures import distance
 from tlf_env.task.scenario import START_MARGIN_MM
 
+FIX_X, FIX_Y = Sample._fields.index("fix_x"), Sample._fields.index("fix_y")
 STARTED, OFF_BASE, NO_ROOM, IN_WALL = range(4)
 START_ATTEMPTS = 1000
 
@@ -112,6 +122,22 @@ def load_robot(arrays: Arrays, lane: int, robot: int) -> bool:
     loaded = laden(empty, mass, behind, inertia)
     write_mass(arrays.constants, robot, lane, loaded)
     return 0.0 <= loaded.d < empty.pivot + empty.T
+
+
+@law
+def equip(arrays: Arrays, lane: int, robot: int, settings: Settings) -> None:
+    """What the computer believes of the wheels, and its filter for the rate of the fixes."""
+    applied = arrays.applied
+    belief = read_belief(arrays.constants, robot, lane)
+    believed = Belief(
+        belief.radius_l * applied[RADIUS_LEFT, robot, lane],
+        belief.radius_r * applied[RADIUS_RIGHT, robot, lane],
+        belief.h * applied[TRACK, robot, lane],
+    )
+    write_belief(arrays.constants, robot, lane, believed)
+    every, _ = fix_timing(arrays, lane, robot, settings.dt)
+    ekf = read_slip_ekf(arrays.constants, robot, lane)
+    write_slip_ekf(arrays.constants, robot, lane, for_fixes(ekf, every))
 
 
 @law
@@ -203,6 +229,10 @@ def place_robot(arrays: Arrays, lane: int, robot: int) -> None:
         arrays.states, robot, lane, estimated_at(estimate, start.x, start.y, start.theta)
     )
     write_observer(arrays.states, robot, lane, start)
+    # Until the first fix comes, the start pose stands for the last one.
+    last = arrays.samples.shape[0] - 1
+    arrays.samples[last, FIX_X, robot, lane] = start.x
+    arrays.samples[last, FIX_Y, robot, lane] = start.y
 
 
 @block
@@ -232,6 +262,7 @@ def start_lane(
     robots = arrays.states.shape[1]
     for robot in range(robots):
         evaluate_all(arrays, lane, robot, settings)
+        equip(arrays, lane, robot, settings)
     for robot in range(robots):
         if not load_robot(arrays, lane, robot):
             return OFF_BASE, robot

@@ -14,6 +14,7 @@ not depend on what else is in its tile. A last tile that is not full repeats its
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 
@@ -27,7 +28,7 @@ from tlf_env.engine.arrays import (
     write_push,
     write_traction,
 )
-from tlf_env.engine.effects import OF_SUBSTEPS, delays, refresh
+from tlf_env.engine.effects import OF_SUBSTEPS, delays, fix_timing, refresh
 from tlf_env.engine.layout import (
     CONSTANTS_IN_TILE,
     EFFECTS_IN_TILE,
@@ -35,9 +36,13 @@ from tlf_env.engine.layout import (
     STATES_IN_TILE,
     TILE_ROWS,
     Draw,
+    Fix,
     Order,
     Reading,
     Sample,
+    Sensors,
+    WheelPair,
+    YawRate,
     in_tile,
     tile_access,
     tile_reader,
@@ -45,9 +50,17 @@ from tlf_env.engine.layout import (
 )
 from tlf_env.engine.sensors import (
     ENCODER_EFFECTS,
+    FIX_NUMBERS,
+    GYRO_EFFECTS,
     NOMINAL_ENCODERS,
+    NOMINAL_FIXES,
+    NOMINAL_GYRO,
     disturbed_encoders,
+    gyro_reading,
+    measured_fix,
+    missing,
     sense_robot,
+    with_outlier,
 )
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.substeps import (
@@ -63,6 +76,8 @@ from tlf_env.engine.substeps import (
     with_grip,
 )
 from tlf_env.numerics.compiled import allocating, block, law, view
+from tlf_env.numerics.rows import replacing
+from tlf_env.onboard.speed_observer import observed_speeds
 from tlf_env.physics.vehicle import Push, advance_pose, follow_wheels, roll, slide
 from tlf_env.task.actions import TORQUE
 
@@ -80,7 +95,12 @@ LIMITING = np.array(
 NOT_PULLING = np.zeros(len(PULLING))
 NOT_LIMITING = np.array([0.0, 0.0, 1.0])
 
+SPEED_OBSERVERS = np.array([in_tile("speed_observer", "angle")])
+NO_SPEED_OBSERVER = np.zeros(1)
+
 body_of = tile_reader("body")
+belief_of = tile_reader("belief")
+speed_observer_of = tile_reader("speed_observer")
 loop_of = tile_reader("wheel_loop")
 ekf_of = tile_reader("ekf")
 slip_ekf_of = tile_reader("slip_ekf")
@@ -89,6 +109,10 @@ motion_of, set_motion = tile_access("motion")
 contact_of, set_contact = tile_access("contact")
 held_of, set_held = tile_access("loop_state")
 sensors_of, set_sensors = tile_access("sensors")
+observed_of, set_observed = tile_access("observed_speed")
+commanded_of, set_commanded = tile_access("commanded")
+fix_of, set_fix = tile_access("fix")
+yaw_rate_of, set_yaw_rate = tile_access("yaw_rate")
 estimate_of, set_estimate = tile_access("estimate")
 slip_of, set_slip = tile_access("slip")
 trace_of, set_trace = tile_access("trace")
@@ -100,9 +124,14 @@ reading_of, set_reading = tile_access("reading")
 moved_of, set_moved = tile_access("moved")
 impulses_of, set_impulses = tile_access("impulses")
 draw_of, set_draw = tile_access("draw")  # of the tile as whole numbers
+with_speeds = replacing(Sensors, "speed_l", "speed_r")
 TICK = in_tile("draw", "tick")
 ROLLS = in_tile("rolls", "all")
 COLUMN = in_tile("column", "place")
+FIX_X, FIX_Y, HERE, WAY_X, WAY_Y = (
+    Fix._fields.index(name) for name in ("x", "y", "here", "way_x", "way_y")
+)
+LAST_X, LAST_Y = Sample._fields.index("fix_x"), Sample._fields.index("fix_y")
 SAMPLE, SAMPLE_FIELDS = in_tile("sample"), len(Sample._fields)
 
 
@@ -170,6 +199,7 @@ def assign(
         )
         kind = arrays.kinds[robot, lane]
         dead, hold = delays(arrays, lane, robot, settings.dt)
+        every, late = fix_timing(arrays, lane, robot, settings.dt)
         if settings.external_wheel_loop and kind != TORQUE:
             kind, hold = EXTERNAL_TORQUE, 0
         command = read_command(arrays.states, robot, lane)
@@ -182,6 +212,8 @@ def assign(
             before_r=before.right,
             hold=hold,
             dead=dead,
+            fix_every=every,
+            fix_delay=late,
         )
         set_order(tile, i, order)
 
@@ -307,6 +339,7 @@ def ask(tile: np.ndarray, substep: int) -> None:
             substep,
         )
         set_held(tile, i, held)
+        set_commanded(tile, i, WheelPair(commanded_l, commanded_r))
         set_traction(tile, i, undisturbed(commanded_l, commanded_r, effects_of(tile, i)))
 
 
@@ -368,13 +401,86 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
         set_contact(tile, i, impulses)
 
 
+class Needs(NamedTuple):
+    """Which of the parts that are left out of a nominal substep some robot of a tile needs."""
+
+    motors: bool
+    pull: bool
+    encoders: bool
+    gyro: bool
+    fixes: bool
+    observers: bool
+
+
 @law
-def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> None:
-    """Encoders, position fixes and estimators, one tick on."""
+def needs_of(tile: np.ndarray) -> Needs:
+    """What the robots of a tile need."""
+    return Needs(
+        motors=differ(tile, LIMITING, NOT_LIMITING),
+        pull=differ(tile, PULLING, NOT_PULLING),
+        encoders=differ(tile, ENCODER_EFFECTS, NOMINAL_ENCODERS),
+        gyro=differ(tile, GYRO_EFFECTS, NOMINAL_GYRO),
+        fixes=differ(tile, FIX_NUMBERS, NOMINAL_FIXES),
+        observers=differ(tile, SPEED_OBSERVERS, NO_SPEED_OBSERVER),
+    )
+
+
+@block
+def deliver_fixes(
+    ring: np.ndarray,
+    samples: np.ndarray,
+    tile: np.ndarray,
+    substep: int,
+    count: int,
+    settings: Settings,
+) -> None:
+    """Position fixes that come seldom, late, never or far off; ``ring`` (Fix, slot, column) keeps them."""
+    slots = ring.shape[1]
+    for i in range(count):
+        draw, column = draw_of(whole(tile), i), whole(tile)[COLUMN, i]
+        order, effects, fix = order_of(tile, i), effects_of(tile, i), fix_of(tile, i)
+        delay = int(order.fix_delay)
+        here = 0.0 if missing(effects, order, draw) else 1.0
+        fix = with_outlier(fix, effects, draw)
+        x, y, way_x, way_y = fix.x, fix.y, 0.0, 0.0
+        if delay > 0:
+            now, then = draw.tick % slots, (draw.tick - delay) % slots
+            ring[FIX_X, now, column], ring[FIX_Y, now, column], ring[HERE, now, column] = x, y, here
+            here = 0.0
+            if draw.tick > delay:
+                x, y, here = (
+                    ring[FIX_X, then, column],
+                    ring[FIX_Y, then, column],
+                    ring[HERE, then, column],
+                )
+                way_x, way_y = ring[WAY_X, then, column], ring[WAY_Y, then, column]
+        if here == 0.0:
+            before = substep - 1 if substep > 0 else samples.shape[0] - 1
+            x, y = samples[before, LAST_X, column], samples[before, LAST_Y, column]
+        set_fix(
+            tile,
+            i,
+            Fix(x=x, y=y, here=here, age=delay * settings.dt, way_x=way_x, way_y=way_y),
+        )
+
+
+@block
+def keep_ways(ring: np.ndarray, tile: np.ndarray, count: int) -> None:
+    """Keep the estimators' ways with the fixes that are measured now."""
+    slots = ring.shape[1]
+    for i in range(count):
+        tick, column, sensors = whole(tile)[TICK, i], whole(tile)[COLUMN, i], sensors_of(tile, i)
+        ring[WAY_X, tick % slots, column] = sensors.way_x
+        ring[WAY_Y, tick % slots, column] = sensors.way_y
+
+
+@law
+def measure(tile: np.ndarray, needs: Needs, dt: float) -> None:
+    """Encoders, gyro and position fixes, one tick on."""
     numbers = whole(tile)
     for i in range(WIDTH):
         numbers[TICK, i] += 1
-    if differ(tile, ENCODER_EFFECTS, NOMINAL_ENCODERS):
+    if needs.encoders:
         for i in range(WIDTH):
             reading = disturbed_encoders(
                 motion_of(tile, i), effects_of(tile, i), draw_of(numbers, i)
@@ -384,19 +490,37 @@ def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> Non
         for i in range(WIDTH):
             motion = motion_of(tile, i)
             set_reading(tile, i, Reading(motion.angle_l, motion.angle_r))
+    if needs.gyro:
+        for i in range(WIDTH):
+            motion, effects = motion_of(tile, i), effects_of(tile, i)
+            rate = gyro_reading(motion, effects, draw_of(numbers, i), dt)
+            set_yaw_rate(tile, i, YawRate(rate))
+    else:
+        for i in range(WIDTH):
+            set_yaw_rate(tile, i, YawRate(motion_of(tile, i).w))
+    for i in range(WIDTH):
+        motion, effects = motion_of(tile, i), effects_of(tile, i)
+        set_fix(tile, i, measured_fix(body_of(tile, i), motion, effects, draw_of(numbers, i)))
+
+
+@law
+def sense_tile(tile: np.ndarray, needs: Needs, substep: int, estimator: int, dt: float) -> None:
+    """Wheel speeds and estimators."""
     for i in range(WIDTH):
         sensors, estimate, slip, trace, sample = sense_robot(
             body_of(tile, i),
+            belief_of(tile, i),
             ekf_of(tile, i),
             slip_ekf_of(tile, i),
-            effects_of(tile, i),
             motion_of(tile, i),
             reading_of(tile, i),
+            fix_of(tile, i),
+            yaw_rate_of(tile, i),
+            commanded_of(tile, i),
             sensors_of(tile, i),
             estimate_of(tile, i),
             slip_of(tile, i),
             trace_of(tile, i),
-            draw_of(numbers, i),
             order_of(tile, i),
             substep,
             estimator,
@@ -407,6 +531,25 @@ def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> Non
         set_slip(tile, i, slip)
         set_trace(tile, i, trace)
         set_sample(tile, i, sample)
+    if needs.observers:
+        for i in range(WIDTH):
+            row, reading, commanded = (
+                speed_observer_of(tile, i),
+                reading_of(tile, i),
+                commanded_of(tile, i),
+            )
+            state = observed_speeds(
+                observed_of(tile, i),
+                reading.left,
+                reading.right,
+                commanded.left,
+                commanded.right,
+                row,
+                dt,
+            )
+            if row.angle > 0.0:
+                set_observed(tile, i, state)
+                set_sensors(tile, i, with_speeds(sensors_of(tile, i), state.speed_l, state.speed_r))
 
 
 @allocating
@@ -443,6 +586,7 @@ def advance_in(
     robots, lanes_in_all = arrays.states.shape[1], arrays.states.shape[2]
     samples = arrays.samples.reshape((*arrays.samples.shape[:2], robots * lanes_in_all))
     torques, patches, variants = arrays.torques, arrays.patches, arrays.variants
+    fixes = arrays.fixes.reshape((*arrays.fixes.shape[:2], robots * lanes_in_all))
     columns = columns_of(tile)
     items = lanes.shape[0] * robots
     for item in range(0, items, WIDTH):
@@ -451,30 +595,37 @@ def advance_in(
         load(tile, CONSTANTS_IN_TILE, constants, constants.shape[0], columns)
         load(tile, STATES_IN_TILE, states, STATE_FIELDS, columns)
         load_effects(tile, applied, columns)
+        needs = needs_of(tile)
         for substep in range(begin, end):
             if actuates:
                 if settings.changing:
                     change_effects(arrays, tile, count, settings)
+                    needs = needs_of(tile)
                 if settings.kinematic:
                     follow(tile, substep, settings.dt)
                 else:
                     ask(tile, substep)
                     if torques.shape[1] > 1:
                         delay_torques(torques, tile, count)
-                    if differ(tile, LIMITING, NOT_LIMITING):
+                    if needs.motors:
                         limit_motors(tile, count)
                     if patches.shape[1] > 0:
                         meet_patches(patches, variants, lanes_in_all, tile, count)
                     for i in range(WIDTH):
                         set_push(tile, i, Push(0.0, 0.0, 0.0))
-                    if differ(tile, PULLING, NOT_PULLING):
+                    if needs.pull:
                         pull(tile, count)
                     if settings.by_chipmunk:
                         hand_over(arrays.inputs, lanes_in_all, tile, count)
                     else:
                         move(tile, count, settings.dt)
             if senses:
-                sense_tile(tile, substep, settings.estimator, settings.dt)
+                measure(tile, needs, settings.dt)
+                if needs.fixes:
+                    deliver_fixes(fixes, samples, tile, substep, count, settings)
+                sense_tile(tile, needs, substep, settings.estimator, settings.dt)
+                if needs.fixes:
+                    keep_ways(fixes, tile, count)
                 for f in range(SAMPLE_FIELDS):
                     for i in range(count):
                         samples[substep, f, columns[i]] = tile[SAMPLE + f, i]

@@ -142,13 +142,14 @@ def normalised_square(d_x: float, d_y: float, i_xx: float, i_xy: float, i_yy: fl
 
 @law
 def correct(
-    estimate: Estimate, ekf: Ekf, x: float, y: float
+    estimate: Estimate, ekf: Ekf, x: float, y: float, here: float = 1.0
 ) -> tuple[Estimate, float, float, float]:
-    """Eqs (31), (39)–(41) with a position fix (mm).
+    """Eqs (31), (39)–(41) with a position fix (mm); ``here`` is 1, or 0 without a fix: then all gains are 0.
 
     Returns the estimate, the innovation in world axes (mm), and its normalised square (NIS).
     """
     i_xx, i_xy, i_yy = inverse_innovation_covariance(estimate, ekf.variance)
+    i_xx, i_xy, i_yy = here * i_xx, here * i_xy, here * i_yy
     d_x, d_y = x - estimate.x, y - estimate.y
     after = corrected_pose(estimate, pose_gain(estimate, i_xx, i_xy, i_yy), d_x, d_y)
     return after, d_x, d_y, normalised_square(d_x, d_y, i_xx, i_xy, i_yy)

@@ -168,6 +168,24 @@ def slip_ekf_constants(parameters: SlipEkfParameters, dt_s: float) -> SlipEkf:
     )
 
 
+with_fix_weights = replacing(SlipEkf, "variance_weight", "mean_weight", "threshold")
+
+
+@law
+def for_fixes(ekf: SlipEkf, every: int) -> SlipEkf:
+    """The filter's constants if a fix comes once in ``every`` samples: its means over time stay the same."""
+    if every == 1:
+        return ekf
+    mean_weight = 1.0 - (1.0 - ekf.mean_weight) ** every
+    share = mean_weight / (2.0 - mean_weight)
+    return with_fix_weights(
+        ekf,
+        variance_weight=1.0 - (1.0 - ekf.variance_weight) ** every,
+        mean_weight=mean_weight,
+        threshold=ekf.threshold * share * (2.0 - ekf.mean_weight) / ekf.mean_weight,
+    )
+
+
 @law
 def surprise(mean: float, variance: float, ekf: SlipEkf) -> float:
     """How far a mean innovation (mm) exceeds what fixes of this variance (mm²) explain; 0 if not.
@@ -315,16 +333,18 @@ corrected_slip = replacing(
 
 @law
 def correct_with_slip(
-    estimate: Estimate, slip: SlipEstimate, ekf: SlipEkf, x: float, y: float
+    estimate: Estimate, slip: SlipEstimate, ekf: SlipEkf, x: float, y: float, here: float = 1.0
 ) -> tuple[Estimate, SlipEstimate, float, float, float]:
     """Update with a position fix (mm); the slip estimates are clipped to their bounds.
 
+    ``here`` is 1, or 0 without a fix: then all gains are 0.
     Returns the estimates, the innovation in world axes (mm), and its normalised square (NIS).
     """
     known = ekf.variance + slip.variance
     i_xx, i_xy, i_yy = inverse_innovation_covariance(
         estimate, max(ekf.variance_factor * known, ekf.least_variance)
     )
+    i_xx, i_xy, i_yy = here * i_xx, here * i_xy, here * i_yy
     d_x, d_y = x - estimate.x, y - estimate.y
     # Differences of successive innovations have twice the variance of a fix; slow errors cancel.
     step_x, step_y = d_x - slip.d_x, d_y - slip.d_y
@@ -337,6 +357,7 @@ def correct_with_slip(
     delta_1 = slip.delta_1 + l_1x * d_x + l_1y * d_y
     delta_2 = slip.delta_2 + l_2x * d_x + l_2y * d_y
     step_2 = step_x * step_x + step_y * step_y
+    last_x, last_y = (d_x, d_y) if here > 0.0 else (slip.d_x, slip.d_y)
     return (
         corrected_pose(estimate, gain, d_x, d_y),
         corrected_slip(
@@ -352,11 +373,11 @@ def correct_with_slip(
             p_11=slip.p_11 - l_1x * slip.p_x1 - l_1y * slip.p_y1,
             p_12=slip.p_12 - l_1x * slip.p_x2 - l_1y * slip.p_y2,
             p_22=slip.p_22 - l_2x * slip.p_x2 - l_2y * slip.p_y2,
-            variance=slip.variance + ekf.variance_weight * (0.25 * step_2 - known),
-            d_x=d_x,
-            d_y=d_y,
-            mean_forward=slip.mean_forward + ekf.mean_weight * (forward - slip.mean_forward),
-            mean_right=slip.mean_right + ekf.mean_weight * (right - slip.mean_right),
+            variance=slip.variance + here * ekf.variance_weight * (0.25 * step_2 - known),
+            d_x=last_x,
+            d_y=last_y,
+            mean_forward=slip.mean_forward + here * ekf.mean_weight * (forward - slip.mean_forward),
+            mean_right=slip.mean_right + here * ekf.mean_weight * (right - slip.mean_right),
         ),
         d_x,
         d_y,

@@ -8,7 +8,9 @@ the paper rounds them to 22 and 128.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
+
+from pydantic import Field
 
 from tlf_env.common.models import Frozen, Positive
 from tlf_env.numerics.compiled import law
@@ -16,12 +18,17 @@ from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
 
 class WheelLoopParameters(Frozen):
-    """Eq. (13): ``gain`` (s² + ``zeros_1`` s + ``zeros_0``) / (s (s + ``pole``)), N·mm per rad/s."""
+    """Eq. (13): ``gain`` (s² + ``zeros_1`` s + ``zeros_0``) / (s (s + ``pole``)), N·mm per rad/s.
+
+    ``speed_observer_rad_s`` is the bandwidth of the observer that measures the wheels' speeds
+    (:mod:`tlf_env.onboard.speed_observer`). None: the difference of two encoder readings.
+    """
 
     gain_Nmm_s: Positive = 150.0
     zeros_1: Positive = 3.0
     zeros_0: Positive = 0.3025
     pole_rad_s: Positive = 2.0
+    speed_observer_rad_s: Annotated[Positive, Field(le=1e4)] | None = None
 
 
 class WheelLoopRow(NamedTuple):

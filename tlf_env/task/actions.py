@@ -8,10 +8,11 @@ from typing import Literal
 import numpy as np
 
 from tlf_env.numerics.compiled import law
+from tlf_env.onboard.calibration import Belief, believed_wheel_speeds
 from tlf_env.onboard.limiter import braked, limited_twist, saturated
 from tlf_env.onboard.spacing import Predecessor, spaced_twist
 from tlf_env.onboard.tracking import ControllerRow, tracking_twist
-from tlf_env.physics.vehicle import Body, wheel_speeds
+from tlf_env.physics.vehicle import Body
 from tlf_env.task.observation import Entry, Preview, Tracking
 
 ACTION_SIZE = 2
@@ -165,8 +166,10 @@ def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float, rea
 
 
 @law
-def wheel_command(a_0: float, a_1: float, kind: int, body: Body) -> tuple[float, float]:
+def wheel_command(
+    a_0: float, a_1: float, kind: int, body: Body, belief: Belief
+) -> tuple[float, float]:
     """Wheel speeds (left, right; rad/s) that a ``twist`` or ``wheel_speed`` action commands."""
     if kind == WHEEL_SPEED:
         return a_0 * FULL_WHEEL_SPEED_RAD_S, a_1 * FULL_WHEEL_SPEED_RAD_S
-    return wheel_speeds(a_0 * FULL_SPEED_MM_S, a_1 * FULL_YAW_RATE_RAD_S, body)
+    return believed_wheel_speeds(a_0 * FULL_SPEED_MM_S, a_1 * FULL_YAW_RATE_RAD_S, body, belief)

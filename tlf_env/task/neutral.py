@@ -152,6 +152,7 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "zeros_1": 3.0,
         "zeros_0": 0.3025,
         "pole_rad_s": 2.0,
+        "speed_observer_rad_s": None,
     },
     "EkfParameters": {
         "alpha_1": 2e-3,
@@ -257,6 +258,7 @@ NEUTRAL: dict[str, dict[str, Any]] = {
     "Uniform": {"type": ALWAYS, "low": ALWAYS, "high": ALWAYS, "every_s": None, "ramp_s": 0.0},
     "Gaussian": {"type": ALWAYS, "std": ALWAYS, "every_s": None, "ramp_s": 0.0, "mean": None},
     "BandLimited": {"type": ALWAYS, "std": ALWAYS, "correlation_s": ALWAYS, "mean": None},
+    "RandomWalk": {"type": ALWAYS, "per_sqrt_s": ALWAYS, "start": None},
     "OrnsteinUhlenbeck": {
         "type": ALWAYS,
         "std": ALWAYS,
