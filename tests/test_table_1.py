@@ -129,5 +129,6 @@ def test_what_the_papers_contact_stiffness_would_do():
         f"overdamped ({rate / (2 * math.pi):.1f} Hz, damping ratio {damping:.2f}), with a time "
         f"constant of {1000 * slowest_s:.0f} ms",
         f"smaller by up to {100 * drive / ROBOT.wheel_radius_mm:.1f} %",
+        f"`radius_right` at {1 / (1 - drive / ROBOT.wheel_radius_mm):.4f}",
     ):
         assert said in text
