@@ -15,7 +15,7 @@ from typing import Any
 from family_devices import draw_motors, draw_robots, draw_sensors
 from family_outside import draw_floor, draw_grip, draw_slip
 from make_board import DOCS
-from make_limits import SMOOTH, counts, friction, noise, ramped, sines, table, wet
+from make_limits import SMOOTH, friction, noise, ramped, sines, table, wet
 from make_parts import put
 from matplotlib.figure import Figure
 
@@ -107,8 +107,7 @@ FAMILIES: dict[str, dict[str, dict[str, Any]]] = {
         "ramps of 0.2 s: `slip-ramps`": preset("slip-ramps"),
         "ramps of 0.05 s": ramped(0.05),
         **{
-            f"band-limited, {s:g} s": noise("band_limited", "correlation_s", s)
-            for s in (10.0, 2.0)
+            f"band-limited, {s:g} s": noise("band_limited", "correlation_s", s) for s in (10.0, 2.0)
         },
         "band-limited, 0.5 s: `slip-noise`": preset("slip-noise"),
         "band-limited, 0.1 s": noise("band_limited", "correlation_s", 0.1),
@@ -181,6 +180,7 @@ FAMILIES: dict[str, dict[str, dict[str, Any]]] = {
         "current limit × 0.9": under(actuator={"current_limit": 0.9}),
         "dead band 1 N·mm": under(actuator={"dead_band_Nmm": 1.0}),
         "dead band 3 N·mm": under(actuator={"dead_band_Nmm": 3.0}),
+        "a small geared motor: `motor`": preset("motor"),
     },
     "sensors": {
         "nominal": {},
@@ -194,19 +194,24 @@ FAMILIES: dict[str, dict[str, dict[str, Any]]] = {
         "fixes 10 ms late": under(position={"delay_s": 0.01}),
         "fixes 50 ms late": under(position={"delay_s": 0.05}),
         "fixes at 30 Hz, 50 ms late": under(position={"period_s": 0.033, "delay_s": 0.05}),
-        "outage of 1 s at 30 s": outage(1.0),
+        "outage of 1 s at 30 s: `fixes-outage`": preset("fixes-outage"),
         "outage of 5 s at 30 s": outage(5.0),
         "half of the fixes missing": under(position={"outage": 0.5}),
         "5 % outliers of 50 mm": under(position={"outlier_share": 0.05, "outlier_std_mm": 50.0}),
+        "motion capture: `fixes-100hz`": preset("fixes-100hz"),
+        "a camera: `fixes-camera`": preset("fixes-camera"),
+        "ultra-wideband radio: `fixes-uwb`": preset("fixes-uwb"),
         "encoder noise of 0.0001 rad": under(encoder={"noise_std_rad": 1e-4}),
-        "encoders of 4096 counts": counts(4096),
-        "encoders of 4096 counts, velocity observer of 80 rad/s": counts(4096) | observed(80.0),
-        "encoders of 1024 counts": counts(1024),
-        "encoders of 1024 counts, velocity observer of 50 rad/s": counts(1024) | observed(50.0),
+        "encoders of 4096 counts: `encoders-4096`": preset("encoders-4096"),
+        "4096 counts, velocity observer of 80 rad/s": preset("encoders-4096") | observed(80.0),
+        "encoders of 1024 counts: `encoders-1024`": preset("encoders-1024"),
+        "1024 counts, velocity observer of 80 rad/s": preset("encoders-1024") | observed(80.0),
         "velocity observer of 80 rad/s alone": observed(80.0),
         "both radii 1 % too large": under(calibration={"radius_left": 1.01, "radius_right": 1.01}),
         "left radius 0.5 % too large": under(calibration={"radius_left": 1.005}),
         "axle 2 % too wide": under(calibration={"track": 1.02}),
+        "radii and axle drawn: `calibration`": preset("calibration"),
+        "motors and sensors, observer of 80 rad/s: `hardware`": preset("hardware") | observed(80.0),
     },
     "robots": {
         "nominal": {},
