@@ -5,7 +5,7 @@ returns pose, twist, slip and covariance; controllers cancel the slip, and the f
 It is compared with the built-in filters on the same random draws, with a fix every 1 ms and every 10 ms.
 
     python examples/ukf_estimator.py --disturbance slip-ramps
-    tlf run infinity --disturbance slip-noise --estimator examples.ukf_estimator:SlipUkf
+    tlf run infinity --disturbance slip-noise --gains tuned --estimator examples.ukf_estimator:SlipUkf
 """
 
 from __future__ import annotations
