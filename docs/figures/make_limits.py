@@ -1,4 +1,4 @@
-"""Where the entries of the board stop: slip of other shapes, little friction, coarse sensors, more robots.
+"""Where the entries of the board stop: slip of other shapes, little friction, real sensors, more robots.
 
 Writes the tables of ``docs/limits.md``. ``python docs/figures/make_limits.py`` drives 16 seeds of each cell
 for 60 s on the batch plant; it takes about a quarter of an hour and needs no extra. ``--seeds N`` drives
@@ -74,6 +74,11 @@ def counts(number: int) -> dict[str, Any]:
     return {"disturbance": {"encoder": {"quantum_rad": 2 * math.pi / number}}}
 
 
+def fixes(period_s: float, delay_s: float) -> dict[str, Any]:
+    """Position fixes that are rare and late."""
+    return {"disturbance": {"position": {"period_s": period_s, "delay_s": delay_s}}}
+
+
 TABLES: dict[str, dict[str, dict[str, Any]]] = {
     "ramps": {f"{1000 * s:g} ms": ramped(s) for s in (0.0, 0.02, 0.05, 0.1, 0.2, 0.5, 3.0)},
     "sines": {f"{f:g} Hz": sines(f) for f in (0.05, 0.15, 0.2, 0.3, 0.4, 0.6, 1.0)},
@@ -91,7 +96,15 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
         for scale in (1.0, 0.6, 0.5, 0.45, 0.4, 0.35, 0.3)
     }
     | {f"patches of {scale:g}": wet(scale) for scale in (0.5, 0.3)},
-    "sensors": {f"{n} counts": counts(n) for n in (65536, 16384, 4096, 1024)},
+    "sensors": {f"{n} counts": counts(n) for n in (65536, 16384, 4096, 1024)}
+    | {
+        f"{n} counts, velocity observer": counts(n) | {"wheel_loop": {"speed_observer_rad_s": 80.0}}
+        for n in (4096, 1024)
+    }
+    | {
+        f"fixes at {1 / period_s:.0f} Hz, {1000 * delay_s:g} ms old": fixes(period_s, delay_s)
+        for period_s, delay_s in ((0.01, 0.0), (0.01, 0.01), (0.033, 0.05), (0.1, 0.0))
+    },
     "robots": {f"{n} robots": {"robots": n} for n in (3, 4, 5, 8)},
 }
 
