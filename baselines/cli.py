@@ -49,7 +49,7 @@ def run(
     disturbance: Annotated[
         str | None,
         typer.Option(
-            help="Disturbance preset: nominal, none, noise, slip, ice, start, payload, ..."
+            help="Disturbance: nominal, none, noise, slip, ice, start, payload, ..., or FILE.yaml."
         ),
     ] = None,
     level: Annotated[
@@ -301,7 +301,7 @@ def bench(
     ] = "reference:consistent,reference:printed,pure_pursuit,feedback_linearisation",
     tasks: Annotated[str, typer.Option(help="Scenarios, comma-separated.")] = "infinity,flower",
     disturbances: Annotated[
-        str, typer.Option(help="Disturbance presets, comma-separated, or all.")
+        str, typer.Option(help="Disturbances, comma-separated: presets or FILE.yaml; or all.")
     ] = "all",
     seeds: Annotated[
         str, typer.Option(help="Seeds FIRST:END; END itself is not run.")

@@ -5,9 +5,12 @@ Bounds are 1.5 times the settled RMS error of each robot there: what the pattern
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 from helpers import TAIL_FROM, Run, drive
+from page_tables import DOCS
 
 from baselines import ReferencePolicy
 from baselines.policies.registry import fit_policy
@@ -69,23 +72,35 @@ def test_flower_at_20_ms_for_more_seeds():
         assert run.rms_mm.max() <= 1.5
 
 
-# The target is that every seed meets the bound. Seed 15 misses it; the bound is not loosened for it.
-SKIDS_WHILE_CATCHING_UP = pytest.mark.xfail(
-    strict=True,
-    reason="robot_2 skids while it catches up, and its filter, which assumes no slip, loses the heading",
-)
+# The target is that every seed meets the bound. One of these misses it, as docs/controller/paper.md says: its
+# last robot skids while it catches up, and the filter, which assumes no slip, loses the heading.
+SEEDS, LOST_SEEDS = range(40), (15,)
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "seed",
-    [pytest.param(k, marks=SKIDS_WHILE_CATCHING_UP) if k == 15 else k for k in range(40)],
-)
-def test_infinity_at_20_ms_holds_for_every_seed(seed):
+@pytest.mark.parametrize("seed", [k for k in SEEDS if k not in LOST_SEEDS])
+def test_infinity_at_20_ms_holds_for_every_seed_but_one(seed):
     run = drive("infinity", seed=seed)
     assert not run.lost.any()
     assert_within(run, (2.7, 3.8, 5.3))
     assert run.rms_mm.max() <= 8.0
+
+
+@pytest.mark.parametrize("seed", LOST_SEEDS)
+def test_infinity_at_20_ms_loses_the_last_robot_of_one_seed(seed):
+    """The others stay within the bound, and no robots touch."""
+    run = drive("infinity", seed=seed)
+    assert run.lost.tolist() == [False, False, True]
+    assert not run.touched.any()
+    assert np.all(run.rms_mm[:2] <= SLACK * np.array([2.7, 3.8]))
+
+
+def test_the_page_names_the_lost_seeds():
+    page = (DOCS / "controller" / "paper.md").read_text(encoding="utf-8")
+    said = re.search(r"of seeds 0–399 are lost \(([\d,\s]+)\)", page)
+    assert said is not None
+    named = [int(seed) for seed in said[1].split(",")]
+    assert tuple(seed for seed in named if seed in SEEDS) == LOST_SEEDS
 
 
 def test_leader_peaks_near_470_mm_while_it_catches_up():

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import tlf_env
+from tlf_env.engine.formation import Formation
 from tlf_env.physics.parameters import RobotParameters
+from tlf_env.task.scenario import load_scenario
 
 ROBOT = RobotParameters()
 G, M, R, H = ROBOT.gravity_mm_s2, ROBOT.mass_kg, ROBOT.wheel_radius_mm, ROBOT.axle_width_mm / 2
@@ -150,6 +152,22 @@ def test_a_tyre_creeps_by_its_share_of_load():
 def test_a_plant_without_creep_says_so():
     with pytest.raises(ValueError, match=r"tyre\.creep needs 'pymunk' or 'batch'"):
         driven(1, tyre={"creep": 0.1}, plant="chipmunk")
+
+
+@pytest.mark.parametrize(("plant", "creeps"), [("pymunk", True), ("chipmunk", False)])
+def test_creep_of_an_adversary_acts_or_is_refused(plant, creeps):
+    """Creep of 0 is no creep, so that ``chipmunk`` takes it."""
+    formation = Formation(load_scenario("infinity", robots=2, plant=plant, adversary=True))
+    formation.reset(0)
+    formation.impose({"tyre.creep": 0.0})
+    for value in (0.1, np.array([0.0, 0.1])):
+        if creeps:
+            formation.impose({"tyre.creep": value})
+        else:
+            with pytest.raises(
+                ValueError, match=r"tyre\.creep .* needs plant 'pymunk'; the tyres of"
+            ):
+                formation.impose({"tyre.creep": value})
 
 
 def test_creep_vanishes_at_rest_and_at_zero():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 from helpers import untimed
 from hypothesis import given
 from hypothesis import strategies as st
+from page_tables import numbers_in, rows_of
 from scipy import stats
 
 from baselines import ReferencePolicy
@@ -446,43 +448,63 @@ def first_within(run: Straight, field: str, value: float, share: float) -> float
     return (np.flatnonzero(wrong)[-1] + 1) * DT
 
 
-# The filter's parameters were searched for with slip read from the wheel speeds, which these two tests
-# leave out. With these parameters two bounds of the position fixes alone are missed. The bounds stay.
-YAW_IS_FOUND_NO_SOONER = pytest.mark.xfail(
-    strict=True,
-    reason="the estimate of yaw slip overshoots: it settles within 30 % after 0.306 s; the bound is 0.271 s",
-)
-COLOURED = pytest.mark.xfail(
-    strict=True,
-    reason="at a noise of 2 mm the innovations are correlated: the variance of slip is 6 % larger than "
-    "without the innovation test; the bound is 5 %",
-)
+# The filter's parameters were searched for with slip read from the wheel speeds, which the next tests leave
+# out. Some bounds are missed with them: those are rows of the page, with the bound and with what is measured.
+ROWS = rows_of("controller/slip-estimator.md", "missed")
+NEVER = slip_ekf_constants(PRESET.model_copy(update={"surprise_threshold": None}), DT)
+
+
+def is_as_stated(row: str, measured: float, bound: float, within: float) -> None:
+    """Whether a row says this bound and, as it says what holds, what was measured."""
+    wanted, stated, holds = ROWS[row]
+    assert numbers_in(wanted)[0] == pytest.approx(bound, abs=5e-4)
+    assert numbers_in(stated) == pytest.approx([measured], abs=within)
+    assert holds == ("holds" if measured < bound else "missed")
+
+
+@functools.cache
+def steps_of_slip(slip: tuple[float, float]) -> tuple[Straight, Straight]:
+    """A step of slip after 4 s, with the innovation test and without it."""
+    return Straight(LEARNING, 0.2**0.5, slip, 9.0), Straight(NEVER, 0.2**0.5, slip, 9.0)
 
 
 @pytest.mark.parametrize(
-    ("field", "slip", "share"),
+    ("field", "slip", "share", "step"),
     [
-        ("delta_1", (40.0, 0.0), 0.8),
-        pytest.param("delta_2", (0.0, 0.3), 1.0, marks=YAW_IS_FOUND_NO_SOONER),
+        ("delta_1", (40.0, 0.0), 0.8, "step of 40 mm/s"),
+        ("delta_2", (0.0, 0.3), 1.0, "step of 0.3 rad/s"),
     ],
 )
-def test_slip_that_sets_in_is_found_sooner_with_surprise(field, slip, share):
-    """Forward slip by a fifth or more, yaw slip by however little."""
-    never = slip_ekf_constants(PRESET.model_copy(update={"surprise_threshold": None}), DT)
-    value = max(slip)
-    sooner = first_within(Straight(LEARNING, 0.2**0.5, slip, 9.0), field, value, 0.3) - 4.0
-    later = first_within(Straight(never, 0.2**0.5, slip, 9.0), field, value, 0.3) - 4.0
-    assert 0.0 < sooner < share * later
+def test_when_slip_that_sets_in_is_settled_with_surprise(field, slip, share, step):
+    """Forward slip sooner than without by a fifth or more, yaw slip later."""
+    sooner, later = (first_within(run, field, max(slip), 0.3) - 4.0 for run in steps_of_slip(slip))
+    row = f"{step}, with innovation test: last time outside ± 30 %"
+    is_as_stated(row, sooner, share * later, within=0.01)
 
 
-@pytest.mark.parametrize("noise_mm", [0.2**0.5, pytest.param(2.0, marks=COLOURED)])
+@pytest.mark.parametrize(("field", "slip"), [("delta_1", (40.0, 0.0)), ("delta_2", (0.0, 0.3))])
+def test_slip_that_sets_in_is_reached_sooner_with_surprise(field, slip):
+    """Both kinds, by a quarter or more; what is missed above is an overshoot."""
+    share = [run.of(field)[4000:] / max(slip) for run in steps_of_slip(slip)]
+    sooner, later = (float(np.argmax(one > 0.7)) * DT for one in share)
+    assert 0.0 < sooner < 0.75 * later
+    if field == "delta_2":
+        row = "step of 0.3 rad/s, with innovation test: 70 % reached"
+        is_as_stated(row, sooner, later, within=0.01)
+        assert share[0].max() == pytest.approx(1.32, abs=0.02)
+
+
+@pytest.mark.parametrize("noise_mm", [0.2**0.5, 2.0])
 def test_steady_motion_hardly_widens_the_slip_variance(noise_mm):
     """Once the fix variance is estimated, the innovation test adds little to the variance of slip."""
-    never = slip_ekf_constants(PRESET.model_copy(update={"surprise_threshold": None}), DT)
     surprised = Straight(LEARNING, noise_mm).of("p_22")[2000:]
-    calm = Straight(never, noise_mm).of("p_22")[2000:]
-    assert surprised.mean() < 1.05 * calm.mean()
-    assert np.mean(surprised > 1.2 * calm) < 0.05
+    calm = Straight(NEVER, noise_mm).of("p_22")[2000:]
+    place = f"steady motion, fixes of {noise_mm:.3g} mm"
+    ratio = surprised.mean() / calm.mean()
+    row = f"{place}: variance of δ₂ with innovation test, over that without"
+    is_as_stated(row, ratio, 1.05, within=0.005)
+    larger = float(np.mean(surprised > 1.2 * calm))
+    is_as_stated(f"{place}: share of time in which it is 1.2 times as large", larger, 0.05, 0.01)
 
 
 def test_the_innovation_test_is_off_at_rest():
@@ -617,25 +639,20 @@ def test_new_slip_is_found_sooner_from_the_wheel_speeds():
 
 
 @pytest.mark.parametrize(
-    "bound",
+    ("encoder", "name"),
     [
-        1.2,
-        pytest.param(
-            1.1,
-            marks=pytest.mark.xfail(
-                strict=True,
-                reason="rough encoders make the slip estimate 11 to 18 % worse; the bound is 10 %",
-            ),
-        ),
+        ({"noise_std_rad": 0.002}, "encoder noise of 0.002 rad"),
+        ({"quantum_rad": 2 * math.pi / 4096}, "encoders of 4096 counts"),
     ],
 )
-@pytest.mark.parametrize(
-    "encoder", [{"noise_std_rad": 0.002}, {"quantum_rad": 2 * math.pi / 4096}], ids=str
-)
-def test_rough_encoders_give_no_false_slip(encoder, bound):
-    """Their roughness is estimated: the slip estimate gets worse by a fifth at most."""
+def test_rough_encoders_give_hardly_any_false_slip(encoder, name):
+    """Their roughness is estimated: the slip estimate gets worse by a fifth at most, a tenth is wanted."""
     quick, slow = Steps(encoder), Steps(encoder, **NO_WHEELS)
-    assert (quick.off[500:].mean(axis=0) < bound * slow.off[500:].mean(axis=0)).all()
+    ratios = quick.off[500:].mean(axis=0) / slow.off[500:].mean(axis=0)
+    assert (ratios < 1.2).all()
+    for slip, ratio in zip(("δ₁", "δ₂"), ratios.tolist(), strict=True):
+        row = f"{name}: error of {slip} with jumps, over that without"
+        is_as_stated(row, ratio, 1.1, within=0.02)
 
 
 def test_without_the_estimated_roughness_rough_encoders_give_false_slip():

@@ -201,6 +201,18 @@ class TestTraining:
         for name, cell in kept_evaluation(curve)["cells"].items():
             assert found[name].score_mm == pytest.approx(cell["score_mm"], rel=1e-3)
 
+    def test_other_content_of_a_disturbances_file_is_another_training(self, tmp_path):
+        from baselines.training.train import check_folder
+
+        path = tmp_path / "gusts.yaml"
+        shares = {"nominal": 1, str(path): 2}
+        path.write_text("slip: {delta_1_mm_s: 20}", encoding="utf-8")
+        check_folder(load_config({**CONFIG, "disturbances": shares}), 0, tmp_path / "out")
+        check_folder(load_config({**CONFIG, "disturbances": shares}), 0, tmp_path / "out")
+        path.write_text("slip: {delta_1_mm_s: 30}", encoding="utf-8")
+        with pytest.raises(ValueError, match="holds a training with a different 'scenarios'"):
+            check_folder(load_config({**CONFIG, "disturbances": shares}), 0, tmp_path / "out")
+
     def test_imitation_brings_the_network_near_the_reference(self):
         import numpy as np
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import SeedRange
 from tlf_env.common.errors import nearest
-from tlf_env.common.presets import preset_names, read_preset_or_file
+from tlf_env.common.presets import beside, is_file_name, preset_names, read_preset_or_file
 from tlf_env.task.scenario import Scenario, load_scenario
 
 
@@ -153,6 +154,9 @@ def read_plan(name: str, fields: Collection[str]) -> dict[str, Any]:
                 f"plan {name!r} has {field!r}; a plan has {', '.join(sorted(fields))}"
                 f"{nearest(field, fields)}"
             )
+        if field == "disturbances" and is_file_name(name):
+            names = [one.strip() for one in value.split(",")] if isinstance(value, str) else value
+            value = beside(Path(name).parent, names)
         options[field] = ",".join(map(str, value)) if isinstance(value, list) else value
         if isinstance(value, bool) or not isinstance(options[field], str | int | float):
             raise ValueError(f"plan {name!r}: {field} must be a text, a number or a list")

@@ -12,7 +12,7 @@ from pydantic import Field, ValidationError, model_validator
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Whole
-from tlf_env.common.presets import read_preset_or_file
+from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
 from tlf_env.task.scenario import Scenario, scenario_with
 
 Count = Annotated[Whole, Field(ge=1)]
@@ -73,7 +73,7 @@ class TrainConfig(Frozen):
     ]  # task: its own scenario fields
     disturbances: Annotated[
         dict[str, NonNegative], Field(min_length=1)
-    ]  # preset: share of episodes
+    ]  # preset or file: share of episodes
     levels: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)  # with equal shares
     checkpoint_every: Count = 1_000_000  # robot steps
     evaluation: EvaluationConfig
@@ -150,6 +150,13 @@ class TrainConfig(Frozen):
             raise ValueError(f"{place}{error}") from error
 
 
+def _place_disturbances(data: dict[str, Any], folder: Path) -> None:
+    """Replace the disturbances' files in the configuration's folder by their paths."""
+    for place in (data, data.get("evaluation")):
+        if isinstance(place, dict) and "disturbances" in place:
+            place["disturbances"] = beside(folder, place["disturbances"])
+
+
 def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> TrainConfig:
     """A training from a preset's name, a YAML file or a mapping; keywords override its fields.
 
@@ -162,6 +169,8 @@ def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> Tra
         data = dict(source)
     else:
         data = read_preset_or_file("training", source)
+        if is_file_name(source):
+            _place_disturbances(data, Path(source).parent)
     data |= {name: value for name, value in overrides.items() if value is not None}
     try:
         return TrainConfig.model_validate(data)

@@ -36,6 +36,7 @@ from baselines.training.model import (
     spread_out,
 )
 from baselines.training.scoring import overall_mm, score_policy
+from tlf_env.task.neutral import scenario_hash
 
 POLICY_FILE, CHECKPOINT_FILE, TRAINING_FILE = (
     "policy.safetensors",
@@ -203,6 +204,7 @@ def check_folder(config: TrainConfig, seed: int, folder: Path) -> None:
     plan = {
         "config": config.model_dump(mode="json"),
         "seed": seed,
+        "scenarios": [f"{place}: {scenario_hash(one)}" for place, one in config.named_scenarios()],
         "simulation": simulation_digest(),
         "torch": torch.__version__,
     }

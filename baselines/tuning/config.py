@@ -18,7 +18,7 @@ from baselines.runs.nested import value_at, with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch, Whole
-from tlf_env.common.presets import read_preset_or_file
+from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
 from tlf_env.onboard.controllers import ControllerFile, controller
 from tlf_env.onboard.kinds import EstimatorKind
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
@@ -268,6 +268,8 @@ def load_tune(source: str | Path, *, trials: int | None = None) -> TuneConfig:
         in one line that names the value and what is allowed.
     """
     found = read_preset_or_file("search", source)
+    if is_file_name(source) and "disturbances" in found:
+        found["disturbances"] = beside(Path(source).parent, found["disturbances"])
     try:
         given = {} if trials is None else {"trials": trials}
         return TuneConfig.model_validate(found | given)

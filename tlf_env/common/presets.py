@@ -187,6 +187,22 @@ def is_file_name(source: str | Path) -> bool:
     return Path(source).suffix.lower() in SUFFIXES
 
 
+def beside(folder: Path, named: Any) -> Any:
+    """What a file in a folder names, with the paths of the YAML files that lie in the folder.
+
+    A relative path starts at the folder, or at the working directory if there is no such file in the folder.
+    ``named`` is a name, a list of names or a mapping by names; all else is returned as it is.
+    """
+    if isinstance(named, list):
+        return [beside(folder, one) for one in named]
+    if isinstance(named, dict):
+        return {beside(folder, one): value for one, value in named.items()}
+    if not isinstance(named, str) or not is_file_name(named):
+        return named
+    path = folder / named
+    return str(path) if path.is_file() else named
+
+
 def read_preset_or_file(kind: str, source: str | Path, others: str = "") -> dict[str, Any]:
     """The mapping of a preset, by its name, or of a YAML file, by its path.
 

@@ -155,8 +155,8 @@ class Formation:
         Raises
         ------
         ValueError
-            for anything but a mapping, an unknown channel, one that cannot change within an episode, or a
-            value out of range.
+            for anything but a mapping, an unknown channel, one that cannot change within an episode, a
+            value out of range, or creep on the plant ``chipmunk``.
         """
         arrays, robots = self.arrays, self.scenario.robot_count
         if not self.scenario.adversary:
@@ -187,6 +187,10 @@ class Formation:
             if not ((row >= channel.low) & (row <= high)).all():
                 raise ValueError(
                     f"{path} {shown(value)} is out of its range, {channel.low:g} to {high:g}"
+                )
+            if path == "tyre.creep" and self.scenario.plant == "chipmunk" and row.any():
+                raise ValueError(
+                    f"{path} {shown(value)} needs plant 'pymunk'; the tyres of 'chipmunk' do not creep"
                 )
             arrays.imposed[number(path), :, 0] = row
 

@@ -10,9 +10,9 @@ The filter adapts in three ways:
   little on other errors.
 - Innovation test (``surprise``): after a change of slip the mean innovation is no longer zero. While it
   exceeds what the noise of the fixes explains, process noise is added.
-- Sudden changes of slip: a floor that begins to move accelerates the light wheels and not the robot.
+- Steps of slip: for some tens of milliseconds the light wheels follow the floor and the robot does not.
   Wheel speeds that change faster than the motors allow are taken at once as slip, or as spin of a wheel
-  that has lost grip.
+  that has lost grip. Steady slip and slip that ramps within 0.2 s do not show in the wheel speeds.
 """
 
 from __future__ import annotations

@@ -196,6 +196,8 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "push": {},
         "position": {},
         "encoder": {},
+        "gyro": {},
+        "calibration": {},
         "actuator": {},
         "radio": {},
         "payload": {},

@@ -13,13 +13,12 @@ from pydantic import (
     AfterValidator,
     Field,
     ValidationError,
-    ValidationInfo,
     field_validator,
     model_validator,
 )
 from pydantic_core import PydanticCustomError
 
-from tlf_env.common.errors import nearest, one_line, shown, suggestion
+from tlf_env.common.errors import nearest, one_line, path_text, shown, suggestion
 from tlf_env.common.files import FILE_NAME
 from tlf_env.common.models import (
     Frozen,
@@ -30,7 +29,7 @@ from tlf_env.common.models import (
     Whole,
     is_number,
 )
-from tlf_env.common.presets import is_file_name, read_preset_or_file
+from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.estimator import EkfParameters
@@ -75,6 +74,7 @@ OTHER_NAMES = {
     "num_envs": "use formations",
     "seed": "reset() takes the seed",
 }
+NAMES_A_FILE = ("disturbance", "world")  # fields that may name a file, also beside the scenario's
 NOT_IN_NAMES = re.compile(r"^[^\w]+|[^\w.+-]")
 
 EndCondition = Literal["lost", "touched"]
@@ -104,9 +104,15 @@ class FrozenDict(dict[str, float]):
         return FrozenDict, (dict(self),)
 
 
-def _disturbance_preset(name: str) -> dict[str, Any]:
-    found = read_preset_or_file("disturbance", name, ", nor a mapping")
-    return {"name": name_of(Path(name)) if is_file_name(name) else name, **found}
+def _named_disturbance(source: str | Path) -> dict[str, Any]:
+    """A disturbance preset or file, with the name that it has by its source."""
+    found = read_preset_or_file("disturbance", source, ", nor a mapping")
+    if list(found) == ["disturbance"]:
+        raise ValueError(
+            f"{path_text(source)} has the key disturbance; a disturbance's file has its channels at the top"
+        )
+    name = name_of(Path(source)) if is_file_name(source) else str(source)
+    return {"name": name, **found}
 
 
 def whole_steps(duration_s: float, period_s: float) -> int | None:
@@ -193,18 +199,14 @@ class Scenario(Frozen):
 
     @field_validator("disturbance", mode="before")
     @classmethod
-    def _named_disturbance(cls, value: Any) -> Any:
-        return _disturbance_preset(value) if isinstance(value, str) else value
+    def _disturbance_of_a_file(cls, value: Any) -> Any:
+        return _named_disturbance(value) if isinstance(value, str | Path) else value
 
     @field_validator("world", mode="before")
     @classmethod
-    def _named_world(cls, value: Any, info: ValidationInfo) -> Any:
-        """A preset or a file; a relative path starts at the scenario's folder or the working directory."""
+    def _world_of_a_file(cls, value: Any) -> Any:
         if not isinstance(value, str | Path):
             return value
-        beside = Path((info.context or {}).get("folder", "")) / value
-        if is_file_name(value) and beside.is_file():
-            value = beside
         return read_preset_or_file("world", value, ", nor a mapping")
 
     @field_validator("reward", mode="before")
@@ -421,23 +423,27 @@ def scenario_with(
     ValueError
         as :func:`load_scenario`; for an unknown key in ``fields``, too.
     """
-    folder = Path()
     if isinstance(source, Scenario):
         data = source.model_dump()
     elif isinstance(source, Mapping):
         data = dict(source)
     else:
         data = _read_source(source, fields.get("control_period_s"))
-        folder = Path(source).parent
     for key, value in fields.items():
         if value is not None:
             data[key] = _merged(data.get(key), value)
+    named = data.get("disturbance")
     if disturbance_level is not None:
         data["disturbance"] = _with_level(data.get("disturbance", {}), disturbance_level)
     try:
-        return Scenario.model_validate(data, context={"folder": folder})
+        return Scenario.model_validate(data)
     except ValidationError as error:
-        raise ValueError(one_line(error, Scenario, OTHER_NAMES)) from error
+        line = one_line(error, Scenario, OTHER_NAMES)
+        if isinstance(named, str | Path) and is_file_name(named):
+            file = path_text(named)
+            if line.startswith("disturbance") and file not in line:
+                line = f"{file}, {line}"
+        raise ValueError(line) from error
 
 
 def _read_source(source: str | Path, control_period_s: Any) -> dict[str, Any]:
@@ -453,6 +459,8 @@ def _read_source(source: str | Path, control_period_s: Any) -> dict[str, Any]:
         )
         return {**found, "name": name_of(path)}
     found = read_preset_or_file("scenario", source, ", nor a .csv file of waypoints")
+    if is_file_name(source):
+        found |= {key: beside(path.parent, found[key]) for key in NAMES_A_FILE if key in found}
     return {"name": name_of(path) if is_file_name(source) else str(source), **found}
 
 
@@ -593,10 +601,12 @@ def _merged(old: Any, new: Any) -> Any:
 
 
 def _with_level(disturbance: Any, level: float) -> dict[str, Any]:
-    if isinstance(disturbance, str):
-        disturbance = _disturbance_preset(disturbance)
+    if isinstance(disturbance, str | Path):
+        disturbance = _named_disturbance(disturbance)
     elif isinstance(disturbance, Disturbance):
         disturbance = disturbance.model_dump()
+    elif not isinstance(disturbance, Mapping):
+        raise ValueError(f"disturbance: Input should be a mapping, got {shown(disturbance)}")
     if not is_number(level) or not 0 <= level < math.inf:
         raise ValueError(f"disturbance_level {shown(level)} must be a finite number, at least 0")
     return {**disturbance, "level": float(level)}
