@@ -145,7 +145,7 @@ class Parts:
             else:
                 self._moved[:, robot] += result.twist * settings.dt
             self._odometry[:, robot] = odometry
-            # The engine's own sums know nothing of the twist, and the slip of the substep before.
+            # The engine's sums lack the twist, and have the slip of the substep before.
             traces[MOVED, robot, 0] = self._moved[:, robot]
 
     def _readings(self, arrays: Arrays, substep: int, robot: int, settings: Settings) -> Readings:
