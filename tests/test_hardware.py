@@ -174,12 +174,16 @@ def test_the_radios_error_has_the_measured_size_and_memory():
         assert math.exp(-1 / slow.time_constant_s) == pytest.approx(after_1_s, abs=0.01)
 
 
-def test_the_outage_lasts_a_second():
-    has = samples("fixes-outage", 32.0)["has_fix"]
-    gone = np.flatnonzero((has == 0.0).all(axis=1))
-    assert len(gone) == 1000
-    assert gone[0] == pytest.approx(30_000, abs=1)
-    assert gone[-1] - gone[0] == 999
+def test_an_outage_lasts_a_second_and_comes_once_in_twenty():
+    has = samples("fixes-outage", 40.0)["has_fix"]
+    starts = []
+    for robot in has.T:
+        for window in (robot[:20_000], robot[20_000:40_000]):
+            gone = np.flatnonzero(window == 0.0)
+            assert len(gone) == 1000
+            assert gone[-1] - gone[0] == 999
+            starts.append(gone[0])
+    assert len(set(starts)) == len(starts)  # each robot's are its own
 
 
 # --- gyro ------------------------------------------------------------------------------------------
@@ -262,10 +266,11 @@ def test_at_level_zero_a_run_is_nominal(preset):
     at_zero = driven(disturbance=preset, disturbance_level=0.0)
     assert (at_zero[0] == states).all()
     assert (at_zero[1] == sensed).all()
-    acting = driven(disturbance=preset)
-    assert (acting[1] != sensed).any() == (preset != "fixes-outage")  # it comes later
-    # No built-in estimator has a gyro.
-    assert (acting[0] != states).any() == (preset not in ("gyro", "fixes-outage"))
+    if preset != "fixes-outage":  # its time is drawn
+        acting = driven(disturbance=preset)
+        assert (acting[1] != sensed).any()
+        # No built-in estimator has a gyro.
+        assert (acting[0] != states).any() == (preset != "gyro")
 
 
 def test_the_scenario_is_the_infinity_with_hardware():
