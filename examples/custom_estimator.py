@@ -16,7 +16,7 @@ import typer
 
 from baselines import ReferencePolicy
 from baselines.runs.run import run_policy
-from tlf_env import load_scenario
+from tlf_env import Readings, load_scenario
 from tlf_env.physics.vehicle import RobotParameters
 
 POSITION_GAIN_PER_S = 8.0
@@ -37,19 +37,22 @@ class ComplementaryFilter:
         """Start at the true pose."""
         self._pose = pose.copy()
 
-    def update(self, steps_rad: np.ndarray, fix_mm: np.ndarray) -> np.ndarray:
-        """Integrate the wheels' increments, then correct by the fix.
+    def update(self, readings: Readings) -> np.ndarray:
+        """Integrate the wheels' increments, then correct by the fix, if one has arrived.
 
         Heading 0 points along +y, unlike ROS REP-103 (+x).
         """
-        left, right = self._radius * steps_rad
+        left, right = self._radius * readings.steps_rad
         forward, turn = 0.5 * (left + right), (right - left) / self._width
         x, y, theta = self._pose
         x -= forward * math.sin(theta + 0.5 * turn)
         y += forward * math.cos(theta + 0.5 * turn)
         theta += turn
+        self._pose = np.array([x, y, theta])
+        if readings.fix_mm is None:
+            return self._pose
         # If a fix is to the right of the estimate while driving forward, the heading is too far left.
-        off_x, off_y = fix_mm[0] - x, fix_mm[1] - y
+        off_x, off_y = readings.fix_mm[0] - x, readings.fix_mm[1] - y
         to_the_right = off_x * math.cos(theta) + off_y * math.sin(theta)
         theta -= self._turn * to_the_right * np.sign(forward)
         self._pose = np.array([x + self._follow * off_x, y + self._follow * off_y, theta])

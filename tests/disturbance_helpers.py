@@ -77,6 +77,7 @@ SHOWS = {
     "actuator.back_emf_s_rad": 0.05,
     "actuator.dead_band_Nmm": 1.0,
     "actuator.current_limit": 0.8,
+    "actuator.stall_torque": 0.8,
     "position.period_s": 0.01,
     "position.delay_s": 0.02,
     "position.outage": 0.3,

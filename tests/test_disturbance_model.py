@@ -162,6 +162,7 @@ def combined(share):
 
 MOTOR = {
     "actuator.back_emf_s_rad": 0.0212,
+    "actuator.stall_torque": 1.89,
     "actuator.current_limit": uniform(0.9, 1.1),
     "actuator.dead_band_Nmm": 1.67,
 }
@@ -265,7 +266,7 @@ PRESETS = {
         "position.outlier_std_mm": 90,
     },
     "fixes-outage": {
-        "position.outage": {"type": "impulse", "value": 1, "at_s": 30, "duration_s": 1}
+        "position.outage": {"type": "pulses", "value": 1, "every_s": 20, "duration_s": 1}
     },
     "gyro": GYRO,
     "calibration": CALIBRATION,

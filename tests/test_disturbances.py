@@ -134,6 +134,7 @@ FIXED = {
     "actuator.back_emf_s_rad": (130, 0.0),
     "actuator.dead_band_Nmm": (131, 0.0),
     "actuator.current_limit": (132, 1.0),
+    "actuator.stall_torque": (144, 1.0),
     "position.period_s": (133, 0.0),
     "position.delay_s": (134, 0.0),
     "position.outage": (135, 0.0),

@@ -34,7 +34,7 @@ def example(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_there_is_something_to_run() -> None:
-    assert len(SCRIPTS) == 13
+    assert len(SCRIPTS) == 14
     assert FILES == ["mixed_formation", "own_robot"]
 
 
@@ -65,6 +65,17 @@ def test_a_short_run_prints_its_result(
     said = capsys.readouterr().out
     assert all(word in said for word in words)
     assert len(said.splitlines()) <= 6
+
+
+@pytest.mark.parametrize("name", ["ukf_estimator"])
+def test_filters_are_compared_in_a_table(
+    example: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example.main(disturbance="slip-ramps", horizon_s=0.3)
+    title, _, *rows = capsys.readouterr().out.splitlines()
+    assert title == "slip-ramps, from 0.1 to 0.3 s, RMS of the worst robot"
+    assert [row.split()[3] for row in rows] == ["ekf", "ekf-slip", "SlipUkf"] * 4
+    assert all(row.split()[-1] == "0" for row in rows)
 
 
 @pytest.mark.parametrize(
@@ -117,6 +128,7 @@ def test_training_runs_and_saves(
     ("name", "role", "part"),
     [
         ("custom_estimator", "estimator", "ComplementaryFilter"),
+        ("ukf_estimator", "estimator", "SlipUkf"),
         ("custom_wheel_loop", "wheel_loop", "PiLoop"),
         ("custom_observer", "observer", "DelayLine"),
     ],

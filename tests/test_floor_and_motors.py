@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 import tlf_env
+from tlf_env.disturbances.channels import nominal_effects
 from tlf_env.engine.formation import Formation
+from tlf_env.engine.substeps import motor_torque
 from tlf_env.physics.parameters import RobotParameters
 from tlf_env.task.scenario import load_scenario
 
@@ -111,6 +113,19 @@ def test_a_motor_follows_its_torque_speed_curve():
     expected = R / k * (t_s - time_s * (1 - np.exp(-t_s / time_s)))
     assert rows[:, 1] == pytest.approx(expected, rel=0.01, abs=1.0)
     assert rows[-1, 4] < 1 / k
+
+
+@pytest.mark.parametrize("stall", [0.5, 1.0, 2.5])
+def test_a_motor_keeps_its_current_limit_until_the_line_from_its_stall_torque(stall):
+    limit, k, current = 15.0, 0.02, 0.9
+    effects = nominal_effects()._replace(
+        actuator_back_emf_s_rad=k, actuator_current_limit=current, actuator_stall_torque=stall
+    )
+    for omega in np.linspace(-60.0, 60.0, 49):
+        line = stall * (1 - k * omega)
+        most = limit * min(max(line, 0.0), current)
+        assert motor_torque(limit, omega, limit, effects) == pytest.approx(most)
+        assert motor_torque(-limit, -omega, limit, effects) == pytest.approx(-most)
 
 
 def test_braking_torque_is_not_limited_by_the_back_emf():

@@ -81,16 +81,20 @@ def test_the_motors_values_follow_from_its_data_sheet():
     assert constant("motor", "actuator.dead_band_Nmm") == pytest.approx(
         Nmm_A * NO_LOAD_A, rel=ROUNDED
     )
+    assert constant("motor", "actuator.stall_torque") == pytest.approx(
+        STALL_Nmm / LIMIT_Nmm, rel=ROUNDED
+    )
     limit = Nmm_A * (DRIVER_V / RESISTOR_OHM - NO_LOAD_A)
     drawn = signal("motor", "actuator.current_limit")
     assert (drawn.low + drawn.high) / 2 == pytest.approx(limit / LIMIT_Nmm, rel=ROUNDED)
     assert (drawn.high - drawn.low) / 2 == pytest.approx(0.1)
 
 
-def test_the_motors_curve_meets_its_data_sheet_at_stall_and_without_load():
+def test_the_motors_curve_is_its_data_sheets_below_the_drivers_limit():
     effects = nominal_effects()._replace(
         actuator_back_emf_s_rad=constant("motor", "actuator.back_emf_s_rad"),
         actuator_dead_band_Nmm=constant("motor", "actuator.dead_band_Nmm"),
+        actuator_stall_torque=constant("motor", "actuator.stall_torque"),
     )
     full = 1000 * LIMIT_Nmm  # mN·mm
 
@@ -98,12 +102,11 @@ def test_the_motors_curve_meets_its_data_sheet_at_stall_and_without_load():
         return motor_torque(full, omega, full, effects)
 
     assert most(0.0) == full
-    assert most(NO_LOAD_RAD_S) == pytest.approx(0.0, abs=ROUNDED * full)
-    assert most(NO_LOAD_RAD_S / 2) == pytest.approx(full / 2, rel=ROUNDED)
-    # The motor itself, with its driver, gives at least as much at every speed.
-    for omega in np.linspace(0.0, 0.99 * NO_LOAD_RAD_S, 25):
+    for omega in np.linspace(0.0, NO_LOAD_RAD_S, 25):
         sheet = 1000 * STALL_Nmm * (1 - omega / NO_LOAD_RAD_S)
-        assert most(omega) <= min(sheet, full) + ROUNDED * full
+        found = most(omega)
+        assert found == pytest.approx(min(sheet, full), abs=2 * ROUNDED * full) or found == 0.0
+    assert most(1.01 * NO_LOAD_RAD_S) == 0.0
     band = 1000 * Nmm_A * NO_LOAD_A
     assert motor_torque(0.99 * band, 0.0, full, effects) == 0.0
     assert motor_torque(1.01 * band, 0.0, full, effects) == 1.01 * band
@@ -171,12 +174,16 @@ def test_the_radios_error_has_the_measured_size_and_memory():
         assert math.exp(-1 / slow.time_constant_s) == pytest.approx(after_1_s, abs=0.01)
 
 
-def test_the_outage_lasts_a_second():
-    has = samples("fixes-outage", 32.0)["has_fix"]
-    gone = np.flatnonzero((has == 0.0).all(axis=1))
-    assert len(gone) == 1000
-    assert gone[0] == pytest.approx(30_000, abs=1)
-    assert gone[-1] - gone[0] == 999
+def test_an_outage_lasts_a_second_and_comes_once_in_twenty():
+    has = samples("fixes-outage", 40.0)["has_fix"]
+    starts = []
+    for robot in has.T:
+        for window in (robot[:20_000], robot[20_000:40_000]):
+            gone = np.flatnonzero(window == 0.0)
+            assert len(gone) == 1000
+            assert gone[-1] - gone[0] == 999
+            starts.append(gone[0])
+    assert len(set(starts)) == len(starts)  # each robot's are its own
 
 
 # --- gyro ------------------------------------------------------------------------------------------
@@ -259,10 +266,11 @@ def test_at_level_zero_a_run_is_nominal(preset):
     at_zero = driven(disturbance=preset, disturbance_level=0.0)
     assert (at_zero[0] == states).all()
     assert (at_zero[1] == sensed).all()
-    acting = driven(disturbance=preset)
-    assert (acting[1] != sensed).any() == (preset != "fixes-outage")  # it comes later
-    # No built-in estimator has a gyro.
-    assert (acting[0] != states).any() == (preset not in ("gyro", "fixes-outage"))
+    if preset != "fixes-outage":  # its time is drawn
+        acting = driven(disturbance=preset)
+        assert (acting[1] != sensed).any()
+        # No built-in estimator has a gyro.
+        assert (acting[0] != states).any() == (preset != "gyro")
 
 
 def test_the_scenario_is_the_infinity_with_hardware():

@@ -21,6 +21,7 @@ from baselines import ReferencePolicy
 from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.observer import Message, ObserverParameters, Reference
+from tlf_env.onboard.parts import Estimated, Readings
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.parameters import RobotParameters
 
@@ -34,13 +35,13 @@ class PaperEkf:
     """Eqs (28)–(41) with matrices."""
 
     def __init__(self, robot: RobotParameters, period_s: float) -> None:
-        self.robot, self.p = robot, EkfParameters()
+        self.robot, self.period_s, self.p = robot, period_s, EkfParameters()
 
     def reset(self, pose: np.ndarray) -> None:
-        self.q, self.P = pose.copy(), np.zeros((3, 3))
+        self.q, self.P, self.way = pose.copy(), np.zeros((3, 3)), [np.zeros(2)]
 
-    def update(self, steps_rad: np.ndarray, fix_mm: np.ndarray) -> np.ndarray:
-        s_l, s_r = self.robot.wheel_radius_mm * steps_rad
+    def update(self, readings: Readings) -> Any:
+        s_l, s_r = self.robot.wheel_radius_mm * readings.steps_rad
         u_1, u_2 = (s_r + s_l) / 2, (s_r - s_l) / self.robot.axle_width_mm
         middle = self.q[2] + u_2 / 2
         sin, cos = math.sin(middle), math.cos(middle)
@@ -50,11 +51,25 @@ class PaperEkf:
         sd = np.array([[self.p.alpha_1, self.p.alpha_2], [self.p.alpha_3, self.p.alpha_4]])
         Q = np.diag((sd @ np.abs([u_1, u_2])) ** 2)
         P = F @ self.P @ F.T + G @ Q @ G.T
-        H = np.eye(2, 3)
-        K = P @ H.T @ np.linalg.inv(H @ P @ H.T + self.p.fix_variance_mm2 * np.eye(2))
-        self.q = q + K @ (fix_mm - H @ q)
-        self.P = (np.eye(3) - K @ H) @ P
+        self.way.append(self.way[-1] + q[:2] - self.q[:2])
+        if readings.fix_mm is not None:
+            age = round((readings.t_s - readings.fix_t_s) / self.period_s)
+            fix = readings.fix_mm + self.way[-1] - self.way[-1 - age]
+            H = np.eye(2, 3)
+            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + self.p.fix_variance_mm2 * np.eye(2))
+            q, P = q + K @ (fix - H @ q), (np.eye(3) - K @ H) @ P
+        self.q, self.P = q, P
+        return self.result()
+
+    def result(self) -> Any:
         return self.q
+
+
+class WholeEkf(PaperEkf):
+    """With its covariance, and the twist of the odometry by default."""
+
+    def result(self) -> Estimated:
+        return Estimated(self.q, covariance=self.P)
 
 
 class PaperWheelLoop:
@@ -414,7 +429,7 @@ def given_a_class(robot: RobotParameters, period_s: float) -> type:
 
 
 WANTED = {
-    "estimator": r"reset\(pose\) and update\(steps_rad, fix_mm\)",
+    "estimator": r"reset\(pose\) and update\(readings\)",
     "wheel_loop": r"reset\(\) and torque\(wanted_rad_s, measured_rad_s\)",
     "observer": r"reset\(pose\) and update\(message, t_s\)",
 }
@@ -475,6 +490,7 @@ def test_what_the_page_shows_runs(monkeypatch: pytest.MonkeyPatch) -> None:
         exec(code, vars(shown))
     for role, name in (
         ("estimator", "Odometry"),
+        ("estimator", "GyroOdometry"),
         ("wheel_loop", "Proportional"),
         ("observer", "Follow"),
     ):

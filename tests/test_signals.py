@@ -312,3 +312,24 @@ def test_a_random_phase_is_drawn_once_for_each_robot_and_episode():
         start, quarter = values(fields, (0, 250), robot=robot)
         phases.append(math.atan2(start, quarter))
     assert np.abs(np.mean(np.exp(1j * np.array(phases)))) < 0.15  # evenly around the circle
+
+
+def test_a_pulse_comes_once_in_every_window_at_a_time_of_its_own():
+    fields = {"type": "pulses", "value": 3.0, "every_s": 0.1, "duration_s": 0.03, "rest": 1.0}
+    windows = values(fields, range(200_000)).reshape(2000, 100)
+    on = windows == 3.0
+    assert (windows[~on] == 1.0).all()
+    assert (on.sum(axis=1) == 30).all()
+    assert (
+        np.abs(np.diff(np.pad(on, ((0, 0), (1, 1))).astype(int), axis=1)).sum(axis=1) == 2
+    ).all()
+    first = on.argmax(axis=1)
+    assert (first.min(), first.max()) == (0, 70)
+    assert first.mean() == pytest.approx(35.0, abs=4 * 20.5 / math.sqrt(2000))
+    whole = {**fields, "duration_s": 0.1}
+    assert (values(whole, range(1000)) == 3.0).all()
+
+
+def test_a_pulse_is_no_longer_than_its_window():
+    why = refusal(type="pulses", value=1, every_s=0.1, duration_s=0.2)
+    assert "duration_s 0.2 must be at most every_s 0.1" in why

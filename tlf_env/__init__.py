@@ -15,6 +15,7 @@ import pettingzoo
 if TYPE_CHECKING:
     from tlf_env.engine.batch import BatchPlant
     from tlf_env.envs.parallel import aec_env, parallel_env
+    from tlf_env.onboard.parts import Estimated, Readings
     from tlf_env.task.info import EndReason, TouchedBy
     from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -22,6 +23,8 @@ __version__ = "0.1.0"
 __all__ = [
     "BatchPlant",
     "EndReason",
+    "Estimated",
+    "Readings",
     "Scenario",
     "TouchedBy",
     "__version__",
@@ -33,6 +36,8 @@ __all__ = [
 _MODULES = {
     "BatchPlant": "tlf_env.engine.batch",
     "EndReason": "tlf_env.task.info",
+    "Estimated": "tlf_env.onboard.parts",
+    "Readings": "tlf_env.onboard.parts",
     "TouchedBy": "tlf_env.task.info",
     "aec_env": "tlf_env.envs.parallel",
     "parallel_env": "tlf_env.envs.parallel",

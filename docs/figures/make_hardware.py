@@ -52,7 +52,7 @@ ROWS: dict[str, dict[str, Any]] = {
     "`nominal`, observer of 80 rad/s": {"disturbance": "nominal"} | observed(80.0),
     "`motor`": {"disturbance": "motor"},
     "`encoders-4096`, observer of 80 rad/s": {"disturbance": "encoders-4096"} | observed(80.0),
-    "`encoders-1024`, observer of 50 rad/s": {"disturbance": "encoders-1024"} | observed(50.0),
+    "`encoders-1024`, observer of 80 rad/s": {"disturbance": "encoders-1024"} | observed(80.0),
     "`fixes-100hz`": {"disturbance": "fixes-100hz"},
     "`fixes-camera`": {"disturbance": "fixes-camera"},
     "`fixes-outage`": {"disturbance": "fixes-outage"},
@@ -63,17 +63,17 @@ ROWS: dict[str, dict[str, Any]] = {
 
 
 def draw_motor(axes: Axes) -> None:
-    """Torque against speed: the data sheet, with the driver's limit, and the preset."""
+    """Torque against speed: the data sheet, and the preset, with the driver's limit."""
     signal = load_scenario(disturbance="motor").disturbance.signal
     effects = nominal_effects()._replace(
         actuator_back_emf_s_rad=signal("actuator.back_emf_s_rad").value,
         actuator_dead_band_Nmm=signal("actuator.dead_band_Nmm").value,
+        actuator_stall_torque=signal("actuator.stall_torque").value,
     )
     omega = np.linspace(0.0, NO_LOAD_RAD_S, 200)
     sheet = STALL_Nmm * (1 - omega / NO_LOAD_RAD_S)
     preset = [motor_torque(1e3 * LIMIT_Nmm, one, 1e3 * LIMIT_Nmm, effects) / 1e3 for one in omega]
     axes.plot(omega, sheet, "--", color=GREY, lw=1.0, label="data sheet, 6 V")
-    axes.plot(omega, np.minimum(sheet, LIMIT_Nmm), color=GREY, lw=1.4, label="with its driver")
     axes.plot(omega, preset, color=hex_colour(0, 3), lw=1.6, label="preset motor")
     axes.axvspan(0.0, 11.2, color=GREY, alpha=0.12, lw=0.0)
     axes.text(0.6, 1.0, "the ∞", color=GREY)

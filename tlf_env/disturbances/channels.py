@@ -93,6 +93,7 @@ CHANNELS = (
     Channel("actuator.back_emf_s_rad", 130, SUBSTEP, 0.0, (0.0, 1.0), "share of torque lost per rad/s"),
     Channel("actuator.dead_band_Nmm", 131, SUBSTEP, 0.0, (0.0, 1000.0), "smaller torques are not delivered"),
     Channel("actuator.current_limit", 132, SUBSTEP, 1.0, (0.0, 10.0), "factor on the torque limit delivered"),
+    Channel("actuator.stall_torque", 144, SUBSTEP, 1.0, (0.0, 100.0), "torque at rest over the torque limit"),
     Channel("position.period_s", 133, EPISODE, 0.0, (0.0, 1.0), "between fixes; 0: one in every physics step"),
     Channel("position.delay_s", 134, EPISODE, 0.0, (0.0, 0.5), "age of a fix when it arrives"),
     Channel("position.outage", 135, SUBSTEP, 0.0, (0.0, 1.0), "share of the fixes that are missing"),
@@ -134,6 +135,7 @@ class Effects(NamedTuple):
     actuator_back_emf_s_rad: float
     actuator_dead_band_Nmm: float
     actuator_current_limit: float
+    actuator_stall_torque: float
     position_outage: float
     position_outlier_share: float
     position_outlier_std_mm: float

@@ -118,6 +118,7 @@ class ActuatorChannels(Frozen):
     back_emf_s_rad: ChannelSignal = _nominal("actuator.back_emf_s_rad")
     dead_band_Nmm: ChannelSignal = _nominal("actuator.dead_band_Nmm")
     current_limit: ChannelSignal = _nominal("actuator.current_limit")
+    stall_torque: ChannelSignal = _nominal("actuator.stall_torque")
 
 
 class RadioChannels(Frozen):

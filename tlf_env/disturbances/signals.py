@@ -12,7 +12,7 @@ from tlf_env.numerics.compiled import law
 from tlf_env.numerics.philox import normal_pair, unit, words
 
 CONSTANT, STEP, IMPULSE, SINE, UNIFORM, GAUSSIAN, ORNSTEIN_UHLENBECK, BAND_LIMITED = range(8)
-RANDOM_WALK = 8
+RANDOM_WALK, PULSES = 8, 9
 # Of a cubic B-spline with independent coefficients of unit variance: the standard deviation, and the lag at
 # which its autocorrelation (a B-spline of degree 7) is 1/e, in distances between coefficients.
 SPLINE_STD = math.sqrt(151.0 / 315.0)
@@ -249,6 +249,33 @@ class BandLimited(_Signal):
         return mean - TAILS * self.std, mean + TAILS * self.std
 
 
+class Pulses(_Signal):
+    """``value`` for ``duration_s`` at a time drawn anew within every ``every_s``, ``rest`` otherwise."""
+
+    type: Literal["pulses"] = "pulses"
+    value: Number
+    every_s: Positive
+    duration_s: Positive
+    rest: Number | None = None  # None: the channel's nominal value
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.duration_s > self.every_s:
+            raise ValueError(f"duration_s {self.duration_s} must be at most every_s {self.every_s}")
+        return self
+
+    def row(self, dt_s: float, period_s: float, nominal: float = 0.0) -> SignalRow:
+        """See :class:`SignalRow`; ``c`` are the ticks of a pulse."""
+        every = max(1, round(self.every_s / dt_s))
+        ticks = min(max(1, round(self.duration_s / dt_s)), every)
+        return SignalRow(PULSES, self.value, _or(self.rest, nominal), float(ticks), float(every))
+
+    def reach(self, nominal: float = 0.0) -> tuple[float, float]:
+        """The two values."""
+        rest = _or(self.rest, nominal)
+        return min(self.value, rest), max(self.value, rest)
+
+
 class RandomWalk(_Signal):
     """Sum of independent Gaussian steps: its standard deviation is ``per_sqrt_s`` · √t after t s.
 
@@ -279,7 +306,8 @@ Signal = Annotated[
     | Gaussian
     | OrnsteinUhlenbeck
     | BandLimited
-    | RandomWalk,
+    | RandomWalk
+    | Pulses,
     Field(discriminator="type"),
 ]
 
@@ -362,6 +390,12 @@ def signal_value(
         else:
             memory = row.c * memory + math.sqrt(1.0 - row.c * row.c) * drawn
         return row.a + row.b * memory, memory
+    if kind == PULSES:
+        index = tick // int(row.every)
+        word, _, _, _ = words(seed, channel, robot, episode, index)
+        first = int(unit(word) * (row.every - row.c + 1.0))
+        since = tick - index * int(row.every) - first
+        return (row.a if 0 <= since < row.c else row.b), memory
     if kind == RANDOM_WALK:
         drawn, _ = normal_pair(seed, channel, robot, episode, tick)
         if tick > 0:

@@ -274,7 +274,7 @@ class Formation:
             drivers.sense(arrays, 0, substep, settings)
             for robot, body_type in self.plant.hits.items() if close else ():
                 drivers.mark(arrays, 0, robot, TOUCHED_BY[body_type])
-            self._parts.estimate(arrays, substep)
+            self._parts.estimate(arrays, substep, settings)
         if close:
             arrays.calm[0] = 0  # a contact may have changed velocities at once
 

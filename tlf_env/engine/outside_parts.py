@@ -9,15 +9,26 @@ import numpy as np
 
 from tlf_env.engine import drivers
 from tlf_env.engine.arrays import Arrays
-from tlf_env.engine.layout import Sample
+from tlf_env.engine.layout import Sample, Trace
 from tlf_env.engine.settings import Settings
-from tlf_env.onboard.parts import Factory, finite, load_part, make_part
+from tlf_env.onboard.parts import (
+    Factory,
+    Readings,
+    checked_estimate,
+    finite,
+    load_part,
+    make_part,
+)
+from tlf_env.onboard.slip_estimator import SlipEstimate
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
+from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.scenario import Scenario
 
-STEPS = [Sample._fields.index("step_l"), Sample._fields.index("step_r")]
-FIXES = [Sample._fields.index("fix_x"), Sample._fields.index("fix_y")]
+COVARIANCE = np.triu_indices(3)  # its order in an Estimate, after the pose
+SLIP = [SlipEstimate._fields.index(name) for name in ("delta_1", "delta_2")]
+ODOMETRY = [Trace._fields.index(name) for name in ("distance", "turn")]
+MOVED = [Trace._fields.index(name) for name in ("moved", "turned")]
 
 
 def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[str, Factory]:
@@ -33,6 +44,13 @@ def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[s
     }
 
 
+def with_axle_width(robot: RobotParameters, width_mm: float) -> RobotParameters:
+    """The robot with the axle's width that its computer believes in."""
+    if width_mm == robot.axle_width_mm:
+        return robot
+    return robot.model_copy(update={"axle_width_mm": width_mm})
+
+
 class Parts:
     """One object per robot and role."""
 
@@ -46,6 +64,9 @@ class Parts:
             "observer": scenario.control_period_s,
         }
         self._made: dict[str, list[Any]] = {}
+        self._radii = np.ones((len(self._robots), 2))  # of the wheels, believed over true
+        self._holds: list[int] = []  # substeps for which the last command still holds
+        self._odometry = self._moved = np.zeros((2, 0))  # (mm and rad, robot) in this control step
 
     def reset(self, arrays: Arrays, settings: Settings) -> None:
         """Make all parts again and start them; observers run ahead by the preview.
@@ -55,10 +76,16 @@ class Parts:
         ValueError
             for a factory that makes no part of its role.
         """
+        belief = arrays.named("belief")
+        self._radii = np.stack([belief.radius_l[:, 0], belief.radius_r[:, 0]], axis=1)
+        robots = [
+            with_axle_width(robot, 2.0 * float(h))
+            for robot, h in zip(self._robots, belief.h[:, 0], strict=True)
+        ]
         self._made = {
             role: [
                 make_part(role, self._names[role], factory, robot, self._periods[role])
-                for robot in self._robots
+                for robot in robots
             ]
             for role, factory in self._factories.items()
         }
@@ -91,13 +118,55 @@ class Parts:
             )
             arrays.rows("command")[:, robot, 0] = torques * MILLINEWTON_PER_NEWTON
 
-    def estimate(self, arrays: Arrays, substep: int) -> None:
-        """Estimators: update with the readings of a substep."""
-        for robot, estimator in enumerate(self._of("estimator")):
-            sample = arrays.samples[substep, :, robot, 0]
-            pose = estimator.update(sample[STEPS], sample[FIXES])
-            estimate = arrays.rows("estimate")
-            estimate[:3, robot, 0] = finite(pose, 3, f"robot_{robot}: the estimator's update()")
+    def estimate(self, arrays: Arrays, substep: int, settings: Settings) -> None:
+        """Estimators: update with the readings of a substep, and hand on what they return."""
+        estimators = self._of("estimator")
+        if not estimators:
+            return
+        if substep == 0:
+            self._holds = [
+                drivers.delays_of(arrays, 0, robot, settings.dt)[1]
+                for robot in range(len(estimators))
+            ]
+            self._odometry, self._moved = np.zeros((2, 2, len(estimators)))
+        estimates, slips, traces = (arrays.rows(name) for name in ("estimate", "slip", "trace"))
+        for robot, estimator in enumerate(estimators):
+            readings = self._readings(arrays, substep, robot, settings)
+            result = checked_estimate(
+                estimator.update(readings), f"robot_{robot}: the estimator's update()"
+            )
+            estimates[:3, robot, 0] = result.pose
+            estimates[3:, robot, 0] = result.covariance[COVARIANCE]
+            slips[SLIP, robot, 0] = result.slip
+            odometry = traces[ODOMETRY, robot, 0]
+            if result.twist is None:
+                self._moved[:, robot] += odometry - self._odometry[:, robot]
+                self._moved[:, robot] += result.slip * settings.dt
+            else:
+                self._moved[:, robot] += result.twist * settings.dt
+            self._odometry[:, robot] = odometry
+            # The engine's sums lack the twist, and have the slip of the substep before.
+            traces[MOVED, robot, 0] = self._moved[:, robot]
+
+    def _readings(self, arrays: Arrays, substep: int, robot: int, settings: Settings) -> Readings:
+        """What a robot's estimator receives of a substep."""
+        sample = Sample(*arrays.samples[substep, :, robot, 0].tolist())
+        tick = int(arrays.clock[0, 1]) * settings.substeps + substep + 1
+        t_s = tick * settings.dt
+        has_fix = sample.has_fix > 0.0
+        wanted = np.zeros(2)
+        if arrays.kinds[robot, 0] != TORQUE:
+            row = "wanted_before" if substep < self._holds[robot] else "wanted"
+            wanted = arrays.rows(row)[:, robot, 0].copy()
+        return Readings(
+            t_s=t_s,
+            steps_rad=np.array([sample.step_l, sample.step_r]) * self._radii[robot],
+            fix_mm=np.array([sample.fix_x, sample.fix_y]) if has_fix else None,
+            fix_t_s=t_s - sample.fix_age if has_fix else None,
+            gyro_rad_s=sample.gyro,
+            wanted_rad_s=wanted,
+            torques_Nmm=np.array([sample.torque_l, sample.torque_r]) / MILLINEWTON_PER_NEWTON,
+        )
 
     def observe(self, arrays: Arrays, settings: Settings) -> None:
         """Observers: the followers' next references."""

@@ -104,13 +104,14 @@ def push_on(body: Body, effects: Effects) -> Push:
 def motor_torque(torque: float, omega: float, limit: float, effects: Effects) -> float:
     """What a motor delivers of a torque: its current limit, its torque–speed curve and its dead band.
 
-    Driving, the back-EMF leaves limit·(1 − k·|ω|); braking it does not limit.
+    Driving, the back-EMF leaves stall·(1 − k·|ω|) of the limit; braking it does not limit.
     """
     if abs(torque) <= effects.actuator_dead_band_Nmm * MILLINEWTON_PER_NEWTON:
         return 0.0
     driving = math.copysign(omega, omega * torque)
     share = min(
-        max(1.0 - effects.actuator_back_emf_s_rad * driving, 0.0), effects.actuator_current_limit
+        max(effects.actuator_stall_torque * (1.0 - effects.actuator_back_emf_s_rad * driving), 0.0),
+        effects.actuator_current_limit,
     )
     most = limit * share
     return min(max(torque, -most), most)

@@ -89,11 +89,11 @@ PULLING = np.array(
 LIMITING = np.array(
     [
         in_tile("effects", f"actuator_{name}")
-        for name in ("back_emf_s_rad", "dead_band_Nmm", "current_limit")
+        for name in ("back_emf_s_rad", "dead_band_Nmm", "current_limit", "stall_torque")
     ]
 )
 NOT_PULLING = np.zeros(len(PULLING))
-NOT_LIMITING = np.array([0.0, 0.0, 1.0])
+NOT_LIMITING = np.array([0.0, 0.0, 1.0, 1.0])
 
 SPEED_OBSERVERS = np.array([in_tile("speed_observer", "angle")])
 NO_SPEED_OBSERVER = np.zeros(1)

@@ -12,7 +12,7 @@ import inspect
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
@@ -23,25 +23,49 @@ PART_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_<][\w.<>]*$"  # <locals>, <lambda>: gi
 Factory = Callable[..., Any]
 
 # Methods of each role, with their arguments.
-METHODS = {
-    "estimator": {"reset": ("pose",), "update": ("steps_rad", "fix_mm")},
+METHODS: dict[str, dict[str, tuple[str, ...]]] = {
+    "estimator": {"reset": ("pose",), "update": ("readings",)},
     "wheel_loop": {"reset": (), "torque": ("wanted_rad_s", "measured_rad_s")},
     "observer": {"reset": ("pose",), "update": ("message", "t_s")},
 }
+NO_SLIP, NO_COVARIANCE = np.zeros(2), np.zeros((3, 3))
+ASYMMETRY = 1e-6  # of a covariance by rounding, relative to the standard deviations
 PREDICT = {"predict": ("observation", "state", "episode_start", "deterministic")}
 
 
+class Readings(NamedTuple):
+    """Sensor readings of one physics period, and what was commanded in it."""
+
+    t_s: float  # end of the period, from the start of the episode
+    steps_rad: (
+        np.ndarray
+    )  # (2,) angle increments of the left and the right wheel, from the encoders
+    fix_mm: np.ndarray | None  # (2,) position fix of c; None if none has arrived in this period
+    fix_t_s: float | None  # the time at which that fix was taken; None without a fix
+    gyro_rad_s: float  # yaw rate, at the end of the period
+    wanted_rad_s: np.ndarray  # (2,) wheel speeds commanded; 0 with the action `torque`
+    torques_Nmm: (
+        np.ndarray
+    )  # (2,) torques commanded, within the motors' limit; 0 on plant `kinematic`
+
+
+class Estimated(NamedTuple):
+    """What an estimator may return in place of the pose alone."""
+
+    pose: Any  # (3,) of c: x and y (mm), heading (rad)
+    twist: Any = None  # (2,) u₁ (mm/s) and u₂ (rad/s); None: wheels' odometry and the slip
+    slip: Any = None  # (2,) δ₁ (mm/s) and δ₂ (rad/s) of eq. (14); None: 0
+    covariance: Any = None  # (3, 3) of the pose: mm², mm·rad, rad²; None: 0
+
+
 class Estimator(Protocol):
-    """Estimates the pose of c; runs at the physics period."""
+    """Estimates the pose of c, and if it can, twist, slip and covariance; runs at the physics period."""
 
     def reset(self, pose: np.ndarray) -> None:
         """Start at the true pose ``(x mm, y mm, θ rad)``."""
 
-    def update(self, steps_rad: np.ndarray, fix_mm: np.ndarray) -> np.ndarray:
-        """Pose ``(3,)`` after one period.
-
-        ``steps_rad`` are the angle increments of the left and right wheel, ``fix_mm`` the position fix.
-        """
+    def update(self, readings: Readings) -> np.ndarray | Estimated:
+        """The pose ``(3,)`` at the end of a period, or an :class:`Estimated`."""
 
 
 class WheelLoop(Protocol):
@@ -150,9 +174,10 @@ def make_part(role: str, name: str, factory: Factory, *given: Any) -> Any:
         try:
             signature.bind(*names)
         except TypeError as error:
+            hint = "; readings is a tlf_env.Readings" if names == ("readings",) else ""
             raise ValueError(
                 f"{what}: {method}{signature} cannot be called as {method}({', '.join(names)}): "
-                f"{error}"
+                f"{error}{hint}"
             ) from error
     return part
 
@@ -202,8 +227,15 @@ def predicted(answer: Any, shape: tuple[int, ...], policy: str) -> tuple[np.ndar
     return actions, answer[1]
 
 
-def finite(value: Any, size: int, what: str) -> np.ndarray:
+def finite(value: Any, size: int, what: str, quantity: str = "") -> np.ndarray:
     """The result of a part, as floats.
+
+    Parameters
+    ----------
+    what
+        Robot and part, for errors.
+    quantity
+        Which of several quantities it is, for errors.
 
     Raises
     ------
@@ -212,5 +244,49 @@ def finite(value: Any, size: int, what: str) -> np.ndarray:
     """
     array = real_numbers(value)
     if array is None or array.shape != (size,) or not np.isfinite(array).all():
-        raise ValueError(f"{what} must return {size} finite numbers, got {shown(value)}")
+        named = f"{quantity} of " if quantity else ""
+        raise ValueError(f"{what} must return {named}{size} finite numbers, got {shown(value)}")
     return array
+
+
+def checked_estimate(answer: Any, what: str) -> Estimated:
+    """The result of an estimator as arrays of floats; ``twist`` stays None if it is not given.
+
+    Raises
+    ------
+    ValueError
+        naming the part and the quantity, if a shape is wrong, a number is not finite, or the covariance is
+        not symmetric or has a negative variance.
+    """
+    given = answer if isinstance(answer, Estimated) else Estimated(answer)
+    return Estimated(
+        pose=finite(given.pose, 3, what),
+        twist=None if given.twist is None else finite(given.twist, 2, what, "a twist"),
+        slip=NO_SLIP if given.slip is None else finite(given.slip, 2, what, "a slip"),
+        covariance=NO_COVARIANCE
+        if given.covariance is None
+        else checked_covariance(given.covariance, what),
+    )
+
+
+def checked_covariance(value: Any, what: str) -> np.ndarray:
+    """A covariance of the pose, ``(3, 3)``, as floats.
+
+    Raises
+    ------
+    ValueError
+        naming the part, for another shape, a number that is not finite, a negative variance, or a matrix
+        that is not symmetric.
+    """
+    array = real_numbers(value)
+    if array is None or array.shape != (3, 3) or not np.isfinite(array).all():
+        wrong = "a covariance of 3 × 3 finite numbers"
+    elif (array.diagonal() < 0.0).any():
+        wrong = "a covariance without negative variances"
+    else:
+        deviations = np.sqrt(array.diagonal())
+        rounding = ASYMMETRY * np.outer(deviations, deviations)
+        if not (np.abs(array - array.T) > rounding).any():
+            return array
+        wrong = "a symmetric covariance"
+    raise ValueError(f"{what} must return {wrong}, got {shown(value)}")

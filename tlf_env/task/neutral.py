@@ -260,6 +260,13 @@ NEUTRAL: dict[str, dict[str, Any]] = {
     "Uniform": {"type": ALWAYS, "low": ALWAYS, "high": ALWAYS, "every_s": None, "ramp_s": 0.0},
     "Gaussian": {"type": ALWAYS, "std": ALWAYS, "every_s": None, "ramp_s": 0.0, "mean": None},
     "BandLimited": {"type": ALWAYS, "std": ALWAYS, "correlation_s": ALWAYS, "mean": None},
+    "Pulses": {
+        "type": ALWAYS,
+        "value": ALWAYS,
+        "every_s": ALWAYS,
+        "duration_s": ALWAYS,
+        "rest": None,
+    },
     "RandomWalk": {"type": ALWAYS, "per_sqrt_s": ALWAYS, "start": None},
     "OrnsteinUhlenbeck": {
         "type": ALWAYS,
