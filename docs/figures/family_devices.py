@@ -50,7 +50,7 @@ def draw_motors(figure: Figure) -> None:
     """Torque gains, dead band, limits, torque-speed curve, delays."""
     names = (
         "Delivered against commanded torque",
-        "Torque–speed curve at full command",
+        "Torque–speed curve at full command, 0.025 s/rad",
         "Delays: speed of a lifted wheel, torque commanded at 0",
         "Torque gains (actuator), 40 episodes of three robots",
     )
@@ -71,12 +71,15 @@ def draw_motors(figure: Figure) -> None:
     gain.set(xlabel="commanded torque (N·mm)", ylabel="delivered torque (N·mm)")
     legend(gain, loc="upper left")
 
-    for style, (k, share) in zip(STYLES, ((0.025, 1.0), (0.025, 0.7), (0.05, 1.0)), strict=False):
-        actuator = {"back_emf_s_rad": k, "current_limit": share}
-        speeds, torques = torque_speed(actuator)
-        curve.plot(speeds, torques, label=f"{k:g} s/rad, current × {share:g}", **style)
-        curve.plot([0, 1 / k], [limit, 0], **LAW)
-    curve.set(xlabel="wheel speed (rad/s)", ylabel="delivered torque (N·mm)", ylim=(0, 17))
+    shapes = ((0.025, 1.0, 1.0), (0.025, 1.0, 0.7), (0.025, 2.0, 1.0))
+    for style, (k, stall, share) in zip(STYLES, shapes, strict=False):
+        fields = {"back_emf_s_rad": k, "stall_torque": stall, "current_limit": share}
+        speeds, torques = torque_speed(fields)
+        curve.plot(
+            speeds, torques, label=f"stall torque {stall:g}, current limit {share:g}", **style
+        )
+        curve.plot([0, 1 / k], [stall * limit, 0], **LAW)
+    curve.set(xlabel="wheel speed (rad/s)", ylabel="delivered torque (N·mm)", ylim=(0, 31))
     legend(curve, loc="upper right")
 
     cases = {

@@ -176,6 +176,9 @@ FAMILIES: dict[str, dict[str, dict[str, Any]]] = {
         "back-EMF 0.005 s/rad": under(actuator={"back_emf_s_rad": 0.005}),
         "back-EMF 0.01 s/rad": under(actuator={"back_emf_s_rad": 0.01}),
         "back-EMF 0.025 s/rad": under(actuator={"back_emf_s_rad": 0.025}),
+        "back-EMF 0.025 s/rad, stall torque 2": under(
+            actuator={"back_emf_s_rad": 0.025, "stall_torque": 2.0}
+        ),
         "current limit × 0.95": under(actuator={"current_limit": 0.95}),
         "current limit × 0.9": under(actuator={"current_limit": 0.9}),
         "dead band 1 N·mm": under(actuator={"dead_band_Nmm": 1.0}),
@@ -194,8 +197,9 @@ FAMILIES: dict[str, dict[str, dict[str, Any]]] = {
         "fixes 10 ms late": under(position={"delay_s": 0.01}),
         "fixes 50 ms late": under(position={"delay_s": 0.05}),
         "fixes at 30 Hz, 50 ms late": under(position={"period_s": 0.033, "delay_s": 0.05}),
-        "outage of 1 s at 30 s: `fixes-outage`": preset("fixes-outage"),
+        "outage of 1 s at 30 s": outage(1.0),
         "outage of 5 s at 30 s": outage(5.0),
+        "an outage of 1 s in every 20 s: `fixes-outage`": preset("fixes-outage"),
         "half of the fixes missing": under(position={"outage": 0.5}),
         "5 % outliers of 50 mm": under(position={"outlier_share": 0.05, "outlier_std_mm": 50.0}),
         "motion capture: `fixes-100hz`": preset("fixes-100hz"),
