@@ -315,6 +315,7 @@ def test_presets_hold_their_numbers_and_nothing_else(name):
     [
         *("payload", "radio", "actuator", "motor", "encoders-4096", "encoders-1024"),
         *("fixes-100hz", "fixes-camera", "fixes-uwb", "gyro", "calibration"),
+        *("rolling", "slope"),
     ],
 )
 def test_chosen_numbers_name_their_source(name):
