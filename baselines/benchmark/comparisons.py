@@ -11,6 +11,7 @@ import numpy as np
 from baselines.benchmark.lines import Line, Strata, failures, stratum_of, worst
 from baselines.benchmark.statistics import paired
 from baselines.policies.registry import policy_names
+from baselines.policies.systems import parse_system
 
 COMPARED = {  # metric: how a policy is compared with its rival, both at the run's worst robot
     "position_rmse_mm": "difference",
@@ -22,7 +23,8 @@ COMPARED = {  # metric: how a policy is compared with its rival, both at the run
 def comparisons(groups: Mapping[str, Strata], ranked: Sequence[str]) -> list[dict[str, Any]]:
     """Each entry against the best of the other policies, stratum by stratum, on the same seeds.
 
-    Entries are the policies that are not among the package's named ones, for example learned policies.
+    Entries are the policies that are neither among the package's named ones nor systems of them, for
+    example learned policies.
     Without such a policy, the first of ``ranked`` is the entry. The rival in a stratum is the other
     policy with the fewest failed runs, and among equals the one with the smallest median position RMS.
     It is chosen by the same runs that are compared, which favours the rival. A privileged policy
@@ -34,7 +36,8 @@ def comparisons(groups: Mapping[str, Strata], ranked: Sequence[str]) -> list[dic
         if an entry and its rival have not run the same seeds.
     """
     known = ("reference", *policy_names())
-    entries = [policy for policy in groups if policy not in known] or list(ranked[:1])
+    entries = [one for one in groups if one not in known and not parse_system(one)]
+    entries = entries or list(ranked[:1])
     others = [
         policy
         for policy, strata in groups.items()
