@@ -58,8 +58,9 @@ def run(
     policy: Annotated[
         str,
         typer.Option(
-            help="reference[:GAINS], reference:FILE.yaml, pure_pursuit, feedback_linearisation, the "
-            "name of a shipped policy, FILE.safetensors (with FILE.json), module:factory, FILE.zip "
+            help="reference[:GAINS], reference:FILE.yaml, pure_pursuit, feedback_linearisation, kanayama, "
+            "CONTROLLER+ESTIMATOR+LIMITER of these (e.g. kanayama+ekf-slip+body), the name of a shipped "
+            "policy, FILE.safetensors (with FILE.json), module:factory, FILE.zip "
             "(with --trust)."
         ),
     ] = "reference",

@@ -253,6 +253,7 @@ def test_the_rival_of_an_entry_fails_least_and_then_errs_least(tmp_path, monkeyp
         *runs("pure_pursuit", (1.0, 2.0), touched=True),
         *runs("reference:tuned", (7.0, 9.0)),
         *runs("feedback_linearisation", (8.0, 9.0)),
+        *runs("kanayama+ekf-slip+body", (7.5, 9.0)),
         *runs("oracle", (0.1, 0.1)),
     ]
     board = aggregate.leaderboard(results(lines, tmp_path))
@@ -262,6 +263,23 @@ def test_the_rival_of_an_entry_fails_least_and_then_errs_least(tmp_path, monkeyp
     assert rows["learned"]["failed"] == [0, 0]
     table = "\n".join(page.comparison_tables(board))
     assert "smaller in 1 of 1 rows, larger in 0, no significant difference in 0" in table
+
+
+@pytest.mark.parametrize(
+    ("policy", "expected"),
+    [
+        ("reference", True),
+        ("kanayama:bounded", True),
+        ("reference:tuned+truth", True),
+        ("reference+ekf+body", True),
+        ("residual", False),
+        ("reference:mine.yaml", False),
+        ("reference:mine.yaml+ekf+body", False),
+        ("kanayama+ekf+mine.yaml", False),
+    ],
+)
+def test_a_system_of_the_packages_parts_is_no_entry(policy, expected):
+    assert comparisons.built_in(policy) == expected
 
 
 def test_without_an_entry_the_first_by_score_is_compared(tmp_path, monkeypatch):

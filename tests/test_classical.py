@@ -5,15 +5,15 @@ import math
 import numpy as np
 import pytest
 
-from baselines.policies.classical import FeedbackLinearisation, PurePursuit
-from baselines.policies.registry import make_policy
+from baselines.policies.classical import FeedbackLinearisation, Kanayama, PurePursuit
+from baselines.policies.registry import fit_policy, make_policy
 from baselines.runs.run import run_policy
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
 
 ENTRIES = tracking_entries(DEFAULT_PREVIEW_S)
-RIVALS = [PurePursuit, FeedbackLinearisation]
+RIVALS = [PurePursuit, FeedbackLinearisation, Kanayama]
 TWISTS = [(400.0, 0.0), (300.0, 0.5), (250.0, -0.8), (0.0, 0.0)]
 
 
@@ -95,6 +95,33 @@ def test_a_wrong_shape_is_reported(rival, shape):
         rival().predict(np.zeros(shape))
 
 
+@pytest.mark.parametrize("speed_mm_s", [100.0, 400.0])
+def test_kanayamas_law_damps_a_lateral_error_critically_over_the_distance(speed_mm_s):
+    """On a straight, a small error e over the distance s obeys e'' + k_θ e' + k_y e = 0, with k_θ² = 4 k_y."""
+    policy, dt, first = Kanayama(), 1e-3, 2.0
+    rate = math.sqrt(policy.k_y_per_mm2)
+    offset, heading = first, 0.0  # to the left of the reference, and counter-clockwise
+    for k in range(1, 1001):
+        seen = {
+            "e_1": 0.0,
+            "e_2": offset,
+            "sin_e_3": math.sin(-heading),
+            "cos_e_3": math.cos(heading),
+            "reference_u_1": speed_mm_s,
+            "reference_u_2": 0.0,
+        }
+        _, turn = policy.twist({name: np.float64(x) for name, x in seen.items()})
+        offset += speed_mm_s * math.sin(heading + turn * dt / 2) * dt
+        heading += turn * dt
+        gone = rate * speed_mm_s * k * dt
+        assert offset == pytest.approx(first * (1.0 + gone) * math.exp(-gone), abs=0.01)
+
+
+def test_kanayamas_law_reduces_a_forward_error_by_its_gain():
+    forward, turn = twist_of(Kanayama(k_x_per_s=3.0).predict(row(reference_u_1=200.0, e_1=10.0))[0])
+    assert (forward, turn) == pytest.approx((230.0, 0.0))
+
+
 def test_pure_pursuit_turns_towards_the_point_ahead():
     for right in (-50.0, 50.0):
         seen = row(reference_u_1=300.0, **{"forward_in_0.5_s": 150.0, "right_in_0.5_s": right})
@@ -107,12 +134,14 @@ def test_pure_pursuit_needs_a_point_ahead():
             make_policy("pure_pursuit", load_scenario(preview_s=preview_s))
 
 
-@pytest.mark.parametrize("name", ["pure_pursuit", "feedback_linearisation"])
+@pytest.mark.parametrize(
+    "name", ["pure_pursuit", "feedback_linearisation", "kanayama:bounded+ekf-slip+body"]
+)
 @pytest.mark.parametrize("task", ["infinity", "flower"])
 def test_it_holds_the_task(name, task):
-    scenario = load_scenario(task)
-    assert scenario.control_period_s == 0.02
-    record = run_policy(scenario, make_policy(name, scenario), 10_000)
+    fitted = fit_policy(name, load_scenario(task))
+    assert fitted.scenario.control_period_s == 0.02
+    record = run_policy(fitted.scenario, fitted.policy, 10_000)
     for metrics in record.metrics():
         assert metrics.position_rmse_mm < 6
         assert not metrics.lost

@@ -11,6 +11,8 @@ import numpy as np
 from baselines.benchmark.lines import Line, Strata, failures, stratum_of, worst
 from baselines.benchmark.statistics import paired
 from baselines.policies.registry import policy_names
+from baselines.policies.systems import parse_system
+from tlf_env.common.presets import preset_names
 
 COMPARED = {  # metric: how a policy is compared with its rival, both at the run's worst robot
     "position_rmse_mm": "difference",
@@ -22,7 +24,7 @@ COMPARED = {  # metric: how a policy is compared with its rival, both at the run
 def comparisons(groups: Mapping[str, Strata], ranked: Sequence[str]) -> list[dict[str, Any]]:
     """Each entry against the best of the other policies, stratum by stratum, on the same seeds.
 
-    Entries are the policies that are not among the package's named ones, for example learned policies.
+    Entries are the policies that are not built in, for example learned policies.
     Without such a policy, the first of ``ranked`` is the entry. The rival in a stratum is the other
     policy with the fewest failed runs, and among equals the one with the smallest median position RMS.
     It is chosen by the same runs that are compared, which favours the rival. A privileged policy
@@ -33,8 +35,7 @@ def comparisons(groups: Mapping[str, Strata], ranked: Sequence[str]) -> list[dic
     ValueError
         if an entry and its rival have not run the same seeds.
     """
-    known = ("reference", *policy_names())
-    entries = [policy for policy in groups if policy not in known] or list(ranked[:1])
+    entries = [policy for policy in groups if not built_in(policy)] or list(ranked[:1])
     others = [
         policy
         for policy, strata in groups.items()
@@ -49,6 +50,15 @@ def comparisons(groups: Mapping[str, Strata], ranked: Sequence[str]) -> list[dic
                 rival = min(rivals, key=lambda name: standing(rivals[name]))
                 rows.append(comparison(lines, rivals[rival]))
     return rows
+
+
+def built_in(policy: str) -> bool:
+    """Whether a policy is among the package's named ones, or a system of its named parts."""
+    known = ("reference", *policy_names())
+    system = parse_system(policy)
+    if system is None:
+        return policy in known
+    return system.controller in known and system.limiter in (None, *preset_names("limiter"))
 
 
 def standing(lines: Sequence[Line]) -> tuple[int, float]:

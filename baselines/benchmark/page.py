@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.policies.registry import describe_overrides
+from baselines.policies.systems import parse_system
 
 
 def markdown(board: dict[str, Any], figures: Sequence[str] = ()) -> str:
@@ -149,8 +150,13 @@ def task_tables(board: dict[str, Any], task: str) -> list[str]:
 
 
 def policy_label(row: dict[str, Any]) -> str:
-    """A policy's name and the scenario fields that it sets; marked if privileged (uses the true state)."""
-    marks = describe_overrides(row.get("overrides", {}))
+    """A policy's name and the scenario fields that it sets; marked if privileged (uses the true state).
+
+    The estimator of a system is in its name.
+    """
+    named = ("estimator",) if parse_system(row["policy"]) else ()
+    overrides = row.get("overrides", {})
+    marks = describe_overrides({key: overrides[key] for key in overrides if key not in named})
     marks += ["privileged"] if row["privileged"] else []
     return row["policy"] + (f" ({'; '.join(marks)})" if marks else "")
 

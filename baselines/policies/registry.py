@@ -11,17 +11,20 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from baselines.policies.card import WEIGHTS
-from baselines.policies.classical import FeedbackLinearisation, PurePursuit
+from baselines.policies.classical import CLASSICAL, Memoryless, make_classical
 from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.policies.reference import ReferencePolicy
+from baselines.policies.systems import (
+    LimitedLaw,
+    make_system,
+    parse_system,
+    system_controllers,
+)
 from tlf_env.common.digest import code_of
-from tlf_env.onboard.controllers import controller_names
 from tlf_env.onboard.parts import Policy, load_part, make_part
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import Scenario, load_scenario
-
-CLASSICAL = {"pure_pursuit": PurePursuit, "feedback_linearisation": FeedbackLinearisation}
 
 # Fields of the scenario that a policy may ask for: its observation, its action and the on-board parts.
 # The task and the disturbance are not among them: they are the same for all policies.
@@ -48,7 +51,7 @@ class FittedPolicy(NamedTuple):
 
 def policy_names() -> list[str]:
     """Names of the policies that are not learned; they need no file."""
-    return [*(f"reference:{gains}" for gains in controller_names()), *CLASSICAL]
+    return system_controllers()
 
 
 def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy:
@@ -58,8 +61,10 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     ----------
     name
         ``reference`` or ``reference:GAINS``, where GAINS is a preset or the path of a controller file
-        (``.yaml``), ``pure_pursuit``, ``feedback_linearisation``, the name of a shipped learned policy,
-        the path of a ``.safetensors`` file (with its card in the same folder), ``module:factory`` of an
+        (``.yaml``), ``pure_pursuit``, ``feedback_linearisation`` or ``kanayama`` (each also with
+        ``:PARAMETERS``, a preset or the path of a ``.yaml`` file), a system
+        ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the name of a shipped learned policy, the
+        path of a ``.safetensors`` file (with its card in the same folder), ``module:factory`` of an
         object with SB3's ``predict``, or the path of an SB3 ``.zip`` file.
     trust
         Allow an SB3 ``.zip`` file: loading one runs code that it contains.
@@ -91,8 +96,8 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
     Raises
     ------
     ValueError
-        as for :func:`make_policy`, and if a policy asks for a field that it may not set, or for an
-        invalid value.
+        as for :func:`make_policy`, if a policy asks for a field that it may not set, or for an invalid
+        value, and if a system names another estimator than the file or the caller has set.
     """
     policy = _made(name, scenario, trust=trust)
     asked = _asked(name, policy, scenario)
@@ -144,6 +149,12 @@ def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
             f"policy {name!r}: scenario_overrides must map fields of {', '.join(OVERRIDABLE)}; "
             f"got {asked!r}"
         )
+    differs = parse_system(name) and scenario.estimator != asked["estimator"]
+    if differs and "estimator" in scenario.model_fields_set:
+        raise ValueError(
+            f"system {name!r} names the estimator {asked['estimator']!r}; the scenario sets "
+            f"{scenario.estimator!r}"
+        )
     return {field: asked[field] for field in asked if field not in scenario.model_fields_set}
 
 
@@ -152,13 +163,17 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         return _stable_baselines(Path(name), scenario, trust=trust)
     if name.lower().endswith(WEIGHTS) or name in shipped_policies():
         return load_policy(name)
+    system = parse_system(name)
+    if system is not None:
+        check_interface(name, scenario, action="twist", observation="tracking")
+        return make_system(system, scenario)
     head, _, tail = name.partition(":")
     if head == "reference" and name != "reference:":
         check_interface(name, scenario, action="twist", observation="tracking")
         return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
-    if head in CLASSICAL and not tail:
+    if head in CLASSICAL:
         check_interface(name, scenario, action="twist", observation="tracking")
-        return CLASSICAL[head](scenario.preview_s, rays=scenario.rays)
+        return make_classical(head, tail, scenario.preview_s, scenario.rays)
     if tail:
         return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])
@@ -209,7 +224,9 @@ def _source_files(policy: Policy) -> list[Path]:
         source = inspect.getsourcefile(type(policy))
     except TypeError:
         return []
-    made_from = policy.files if isinstance(policy, ReferencePolicy) else ()
+    made_from = (
+        policy.files if isinstance(policy, ReferencePolicy | Memoryless | LimitedLaw) else ()
+    )
     return [Path(source), *made_from] if source else []
 
 

@@ -24,6 +24,10 @@ KINDS = {
     "plan": "plans",
     "training": "train",
     "search": "tune",
+    "limiter": "limiters",
+    "pure_pursuit": "laws/pure_pursuit",
+    "feedback_linearisation": "laws/feedback_linearisation",
+    "kanayama": "laws/kanayama",
 }  # kinds of preset, and the subfolder of each
 SUFFIXES = (".yaml", ".yml")
 MOST_LEVELS = 50  # of mappings and lists in each other
@@ -187,6 +191,13 @@ def is_file_name(source: str | Path) -> bool:
     return Path(source).suffix.lower() in SUFFIXES
 
 
+def preset_or_file(kind: str, source: str) -> Path | None:
+    """Where a preset or the YAML file that a source names lies; None if it is neither's name."""
+    if source in preset_names(kind):
+        return presets_folder(kind) / f"{source}.yaml"
+    return Path(source) if is_file_name(source) else None
+
+
 def beside(folder: Path, named: Any) -> Any:
     """What a file in a folder names, with the paths of the YAML files that lie in the folder.
 
@@ -220,11 +231,10 @@ def read_preset_or_file(kind: str, source: str | Path, others: str = "") -> dict
     ValueError
         in one line, if the source is neither, or as :func:`read_yaml`.
     """
+    path = preset_or_file(kind, str(source))
+    if path is not None:
+        return read_yaml(path)
     names = preset_names(kind)
-    if str(source) in names:
-        return read_yaml(presets_folder(kind) / f"{source}.yaml")
-    if isinstance(source, str | Path) and is_file_name(source):
-        return read_yaml(Path(source))
     raise ValueError(
         f"{kind} {shown(str(source))} is not one of {', '.join(names)}, nor a .yaml file{others}"
         f"{suggestion(source, names)}"

@@ -1,0 +1,259 @@
+"""Systems: a controller, an estimator and a limiter by name, ``CONTROLLER+ESTIMATOR+LIMITER``."""
+
+from __future__ import annotations
+
+import inspect
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from pydantic import ValidationError, field_validator
+
+from baselines.policies.classical import (
+    BOUNDS,
+    CLASSICAL,
+    Memoryless,
+    classical_names,
+    make_classical,
+)
+from baselines.policies.reference import ReferencePolicy
+from tlf_env.common.errors import one_line, suggestion
+from tlf_env.common.models import Frozen, NonNegative
+from tlf_env.common.presets import (
+    is_file_name,
+    preset_names,
+    preset_or_file,
+    read_preset_or_file,
+)
+from tlf_env.numerics.compiled import driver
+from tlf_env.onboard.controllers import controller, controller_names
+from tlf_env.onboard.kinds import ESTIMATOR_KINDS
+from tlf_env.onboard.limiter import TwistLimits
+from tlf_env.onboard.parts import Policy
+from tlf_env.onboard.spacing import Spacing
+from tlf_env.onboard.tracking import Controller, ControllerRow, controller_row
+from tlf_env.task.actions import ACTION_SIZE, twist_action
+from tlf_env.task.scenario import Scenario
+
+FORM = "CONTROLLER+ESTIMATOR or CONTROLLER+ESTIMATOR+LIMITER"
+NOT_LIMITED = (".zip", ".safetensors")  # learned policies, whose paths may contain a +
+
+
+class SystemName(NamedTuple):
+    """The names of a system's parts; ``str`` gives the system's name."""
+
+    controller: str
+    estimator: str
+    limiter: str | None  # None: the limits of the controller's own file, if any
+
+    def __str__(self) -> str:
+        return "+".join(part for part in self if part is not None)
+
+
+class Limiter(Frozen):
+    """Contents of a limiter file: limits on the twist, distance keeping and lead, for any controller.
+
+    Bounds on errors are part of a controller: they change what its law sees, not what it may command.
+    """
+
+    limits: TwistLimits = TwistLimits()
+    spacing: Spacing | None = None
+    lead_s: NonNegative = 0.0
+
+    @field_validator("limits")
+    @classmethod
+    def _of_the_command(cls, limits: TwistLimits) -> TwistLimits:
+        for name in BOUNDS:
+            if getattr(limits, name) is not None:
+                raise ValueError(
+                    f"{name} belongs to a controller; a limiter has no bound on errors"
+                )
+        return limits
+
+
+def parse_system(name: str) -> SystemName | None:
+    """The parts of a system's name; None for the name of another policy.
+
+    The first ``+`` before an estimator's name ends the controller, so that the paths of the controller's
+    and the limiter's file may contain a ``+``.
+
+    Raises
+    ------
+    ValueError
+        naming the part, if the name has a ``+`` and no estimator behind it, or a part is empty.
+    """
+    if "+" not in name or name.lower().endswith(NOT_LIMITED):
+        return None
+    kinds = "|".join(map(re.escape, ESTIMATOR_KINDS))
+    found = re.match(rf"(?P<controller>.*?)\+(?P<estimator>{kinds})(?:\+(?P<limiter>.*))?$", name)
+    if found is None:
+        head, _, tail = name.partition("+")
+        if ":" in head and is_file_name(name) and Path(name.partition(":")[2]).is_file():
+            return None  # the path of one controller file
+        raise _unknown(name, "estimator", tail.partition("+")[0], ESTIMATOR_KINDS)
+    system = SystemName(**found.groupdict())
+    if not system.controller:
+        raise _unknown(name, "controller", "", system_controllers())
+    if system.limiter == "":
+        raise _unknown(name, "limiter", "", limiters())
+    return system
+
+
+def system_controllers() -> list[str]:
+    """Names of the controllers that need no file."""
+    return [*(f"reference:{gains}" for gains in controller_names()), *classical_names()]
+
+
+def limiters() -> list[str]:
+    """What a limiter may be: the presets, or a file."""
+    return [*preset_names("limiter"), "FILE.yaml"]
+
+
+def load_limiter(source: str | Path) -> Limiter:
+    """A limiter, by the name of a preset (``configs/limiters``) or the path of a ``.yaml`` file.
+
+    Raises
+    ------
+    ValueError
+        in one line, if there is no such preset or file, or a key or value in it is not allowed.
+    """
+    try:
+        return Limiter.model_validate(read_preset_or_file("limiter", source))
+    except ValidationError as error:
+        raise ValueError(f"{source}: {one_line(error, Limiter)}") from error
+
+
+def own_limiter(law: Controller) -> Limiter:
+    """What a controller's own file limits, apart from errors: the limiter of ``CONTROLLER+ESTIMATOR``."""
+    unbounded = law.limits.model_copy(update=dict.fromkeys(BOUNDS))
+    return Limiter(limits=unbounded, spacing=law.spacing, lead_s=law.lead_s)
+
+
+def behind(law: Controller, limiter: Limiter) -> Controller:
+    """A controller with its gains and bounds on errors, behind a limiter in place of its own limits."""
+    bounds = {name: getattr(law.limits, name) for name in BOUNDS}
+    return Controller(
+        gains=law.gains,
+        limits=limiter.limits.model_copy(update=bounds),
+        spacing=limiter.spacing,
+        lead_s=limiter.lead_s,
+    )
+
+
+@driver
+def _limited(
+    rows: np.ndarray, scales: np.ndarray, row: ControllerRow, wanted: np.ndarray, out: np.ndarray
+) -> None:
+    for i in range(rows.shape[0]):
+        out[i, 0], out[i, 1] = twist_action(rows[i], scales, row, wanted[i, 0], wanted[i, 1])
+
+
+class LimitedLaw:
+    """A law behind a limiter, with the signature of SB3's ``predict``.
+
+    Parameters
+    ----------
+    law
+        A classical law, which wants a twist for each observation.
+    limiter
+        What its twist is limited by; its lead shifts the reference that the law sees.
+    control_period_s
+        Control period, s; needed for the limits on accelerations.
+    preview_s
+        The scenario's previews, s; a lead is computed from the first.
+
+    Raises
+    ------
+    ValueError
+        for a lead without a first preview above 0.
+    """
+
+    privileged = False
+    scenario_overrides: Mapping[str, Any] = {}
+    files: tuple[Path, ...] = ()
+
+    def __init__(
+        self,
+        law: Memoryless,
+        limiter: Limiter,
+        control_period_s: float,
+        preview_s: tuple[float, ...],
+    ) -> None:
+        self.law, self.limiter = law, limiter
+        # The gains of the row are not used: the law that wants the twist is another.
+        self._row = controller_row(behind(Controller(), limiter), control_period_s, preview_s)
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """``twist`` action for one ``tracking`` observation or a batch, and ``state`` unchanged.
+
+        Raises
+        ------
+        ValueError
+            as the law's ``wanted``.
+        """
+        observation = np.asarray(observation)
+        wanted = self.law.wanted(observation, self.limiter.lead_s)
+        rows = np.ascontiguousarray(np.atleast_2d(observation))
+        action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
+        _limited(rows, self.law.scales, self._row, wanted, action)
+        return (action[0] if observation.ndim == 1 else action), state
+
+
+def make_system(system: SystemName, scenario: Scenario) -> Policy:
+    """The policy of a system, for a scenario with ``tracking`` observations and ``twist`` actions.
+
+    Its ``scenario_overrides`` ask for the estimator, with the scenario's parameters whatever the
+    controller's file has, so that all controllers are compared on the same filter. A system on the true
+    state is privileged.
+
+    Raises
+    ------
+    ValueError
+        in one line, for an unknown part, an invalid file, or a lead without a first preview above 0.
+    """
+    name = str(system)
+    limiter, files = None, []
+    if system.limiter is not None:
+        path = preset_or_file("limiter", system.limiter)
+        if path is None:
+            raise _unknown(name, "limiter", system.limiter, limiters())
+        limiter = load_limiter(system.limiter)
+        files.append(path)
+    head, _, tail = system.controller.partition(":")
+    kind = "controller" if head == "reference" else head
+    known = kind == "controller" or kind in CLASSICAL
+    path = preset_or_file(kind, tail) if known else None
+    if not known or (path is None and system.controller != head):
+        raise _unknown(name, "controller", system.controller, system_controllers())
+    files += [] if path is None else [path]
+    policy: ReferencePolicy | LimitedLaw
+    period_s, preview_s = scenario.control_period_s, scenario.preview_s
+    if kind == "controller":
+        law = controller(tail or "consistent")
+        whole = behind(law, own_limiter(law) if limiter is None else limiter)
+        policy = ReferencePolicy(whole, period_s, preview_s)
+    else:
+        classical = make_classical(head, tail, preview_s, scenario.rays)
+        policy = LimitedLaw(classical, limiter or Limiter(), period_s, preview_s)
+        files.append(Path(inspect.getfile(type(classical))))
+    policy.files = tuple(files)
+    policy.privileged = system.estimator == "truth"
+    policy.scenario_overrides = {"estimator": system.estimator}
+    return policy
+
+
+def _unknown(name: str, part: str, given: str, allowed: Iterable[str]) -> ValueError:
+    """The error for an unknown part of a system."""
+    names = list(allowed)
+    return ValueError(
+        f"system {name!r}: {part} {given!r} is not one of {', '.join(names)}{suggestion(given, names)}"
+        f"; a system is {FORM}"
+    )
