@@ -504,7 +504,7 @@ def measure(tile: np.ndarray, needs: Needs, dt: float) -> None:
 
 
 @law
-def sense_tile(tile: np.ndarray, needs: Needs, substep: int, estimator: int, dt: float) -> None:
+def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> None:
     """Wheel speeds and estimators."""
     for i in range(WIDTH):
         sensors, estimate, slip, trace, sample = sense_robot(
@@ -531,25 +531,29 @@ def sense_tile(tile: np.ndarray, needs: Needs, substep: int, estimator: int, dt:
         set_slip(tile, i, slip)
         set_trace(tile, i, trace)
         set_sample(tile, i, sample)
-    if needs.observers:
-        for i in range(WIDTH):
-            row, reading, commanded = (
-                speed_observer_of(tile, i),
-                reading_of(tile, i),
-                commanded_of(tile, i),
-            )
-            state = observed_speeds(
-                observed_of(tile, i),
-                reading.left,
-                reading.right,
-                commanded.left,
-                commanded.right,
-                row,
-                dt,
-            )
-            if row.angle > 0.0:
-                set_observed(tile, i, state)
-                set_sensors(tile, i, with_speeds(sensors_of(tile, i), state.speed_l, state.speed_r))
+
+
+@law
+def observe_wheels(tile: np.ndarray, dt: float) -> None:
+    """Wheel speeds by the velocity observers of the robots that have one."""
+    for i in range(WIDTH):
+        row, reading, commanded = (
+            speed_observer_of(tile, i),
+            reading_of(tile, i),
+            commanded_of(tile, i),
+        )
+        state = observed_speeds(
+            observed_of(tile, i),
+            reading.left,
+            reading.right,
+            commanded.left,
+            commanded.right,
+            row,
+            dt,
+        )
+        if row.angle > 0.0:
+            set_observed(tile, i, state)
+            set_sensors(tile, i, with_speeds(sensors_of(tile, i), state.speed_l, state.speed_r))
 
 
 @allocating
@@ -623,7 +627,9 @@ def advance_in(
                 measure(tile, needs, settings.dt)
                 if needs.fixes:
                     deliver_fixes(fixes, samples, tile, substep, count, settings)
-                sense_tile(tile, needs, substep, settings.estimator, settings.dt)
+                sense_tile(tile, substep, settings.estimator, settings.dt)
+                if needs.observers:
+                    observe_wheels(tile, settings.dt)
                 if needs.fixes:
                     keep_ways(fixes, tile, count)
                 for f in range(SAMPLE_FIELDS):
