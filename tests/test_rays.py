@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import math
 import pickle
+from typing import Any
 
 import gymnasium
 import numpy as np
@@ -431,7 +432,10 @@ def test_a_copy_and_a_pickle_go_on_bit_for_bit():
     observations, _ = env.reset(seed=0)
     play(env, observations, 40, lambda env, _: dict.fromkeys(env.agents, np.array([0.4, 0.1])))
     others = [copy.deepcopy(env), pickle.loads(pickle.dumps(env))]
-    push = lambda env, _: dict.fromkeys(env.agents, np.array([0.4, -0.1]))  # noqa: E731
+
+    def push(env: Any, _: Any) -> dict[str, np.ndarray]:
+        return dict.fromkeys(env.agents, np.array([0.4, -0.1]))
+
     results = [digest(play(one, observations, 60, push)) for one in (env, *others)]
     assert results[0] == results[1] == results[2]
 

@@ -122,7 +122,10 @@ def resident_bytes() -> int:
 
 
 @pytest.mark.slow
-@pytest.mark.skipif(not Path("/proc/self/statm").exists(), reason="tells no memory here")
+@pytest.mark.skipif(
+    not Path("/proc/self/statm").exists(),
+    reason="only Linux gives the memory of a process in /proc/self/statm",
+)
 def test_memory_stays_while_a_million_steps_with_resets_are_taken():
     formations, steps = 500, 2000
     env = FormationVectorEnv("infinity", formations, horizon_s=2.0, autoreset_mode="SameStep")
