@@ -297,6 +297,7 @@ def take_plan(ctx: typer.Context, plan: str | None) -> str | None:
 
 @app.command()
 def bench(
+    ctx: typer.Context,
     policies: Annotated[
         str, typer.Option(help="Names as in `tlf run --policy`, comma-separated.")
     ] = "reference:consistent,reference:printed,pure_pursuit,feedback_linearisation",
@@ -340,13 +341,42 @@ def bench(
             callback=take_plan,
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("results/bench"),
+    test: Annotated[
+        bool,
+        typer.Option(
+            "--test",
+            help="Run the test set: cases with random tasks, robots and disturbances, 20000:20200 unless "
+            "--seeds has others. Every look is logged.",
+        ),
+    ] = False,
+    test_seed: Annotated[
+        str | None,
+        typer.Option(help="Run cases made from this text in place of the published test set."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the results; default results/bench or results/test."),
+    ] = None,
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print leaderboard.json instead of the tables.")
     ] = False,
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
+    if test or test_seed is not None:
+        refuse_beside_test(ctx)
+        bench_test(
+            listed(policies),
+            seeds if given(ctx, "seeds") else None,
+            test_seed,
+            trust=trust,
+            out=out or Path("results/test"),
+            processes=processes or os.cpu_count() or 1,
+            ray=ray,
+            as_json=as_json,
+        )
+        return
+    out = out or Path("results/bench")
     from baselines.benchmark.bench import named_scenarios, run_bench
     from baselines.benchmark.plan import Plan, disturbance_presets, parse_seeds, parse_sweep
     from baselines.runs.provenance import command_line
@@ -388,6 +418,68 @@ def bench(
     else:
         screen.print(board_table(board))
         screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
+
+
+def given(ctx: typer.Context, option: str) -> bool:
+    """Whether an option has another source than its default: the command line or a plan."""
+    source = ctx.get_parameter_source(option)
+    return source is not None and source.name in ("COMMANDLINE", "DEFAULT_MAP")
+
+
+def refuse_beside_test(ctx: typer.Context) -> None:
+    """Refuse options that the cases of the test set have themselves.
+
+    Raises
+    ------
+    ValueError
+        naming the first option.
+    """
+    for option in ("tasks", "disturbances", "level", "sweep", "horizon_s", "plant"):
+        if given(ctx, option):
+            raise ValueError(
+                f"--{option.replace('_', '-')} cannot be used with --test: every case has its own"
+            )
+
+
+def bench_test(
+    policies: tuple[str, ...],
+    seeds: str | None,
+    test_seed: str | None,
+    *,
+    trust: bool,
+    out: Path,
+    processes: int,
+    ray: str | None,
+    as_json: bool,
+) -> None:
+    """Run entries on the test set, and write and print the tables."""
+    from baselines.benchmark.bench import run_bench
+    from baselines.benchmark.plan import parse_seeds
+    from baselines.benchmark.testset_page import write_test_board
+    from baselines.benchmark.testset_plan import PUBLISHED, log_look, plan_of_test
+    from baselines.runs.provenance import command_line
+    from baselines.tables import testset_table
+
+    if test_seed == "":
+        raise ValueError("--test-seed must not be empty")
+    cases = PUBLISHED if seeds is None else parse_seeds(seeds)
+    plan = plan_of_test(policies, cases, test_seed or "", trust=trust)
+    warn_of_compiling()
+    with progress_bar("test set") as update:
+        results = run_bench(
+            plan,
+            out,
+            processes=processes,
+            ray_address=ray,
+            progress=update,
+            begin=lambda: log_look(plan, out),
+        )
+    board = write_test_board(results, out, command_line(sys.argv[1:]))
+    if as_json:
+        typer.echo(json.dumps(board, indent=1, allow_nan=False))
+        return
+    screen.print(testset_table(board))
+    screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
 
 
 @app.command()

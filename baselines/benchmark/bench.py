@@ -109,8 +109,14 @@ def run_bench(
     processes: int = 1,
     ray_address: str | None = None,
     progress: Callable[[int, int], None] | None = None,
+    begin: Callable[[], None] = lambda: None,
 ) -> Results:
     """Run what is missing of a plan, here or on a Ray cluster.
+
+    Parameters
+    ----------
+    begin
+        Called once before the first episode, after the plan has been found to be valid.
 
     Raises
     ------
@@ -122,6 +128,7 @@ def run_bench(
     if find_spec("arch") is None:
         raise ValueError("the tables need arch (pip install 'tlf-env[bench]')")
     results = Results(folder, plan)
+    begin()
     todo = results.missing()
     total = len(plan.episodes())
     if progress is not None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import SeedRange
@@ -42,6 +42,8 @@ class Plan:
 
     ``overrides`` are fields of every scenario; ``sweep`` is the path of a knob, a disturbance's parameter.
     """
+
+    unrecorded: ClassVar[tuple[str, ...]] = ("trust",)  # a permission, which changes no result
 
     policies: tuple[str, ...]
     tasks: tuple[str, ...]

@@ -16,6 +16,7 @@ from pydantic import (
 
 from baselines.runs.nested import value_at, with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
+from baselines.runs.splits import check_training
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch, Whole
 from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
@@ -222,7 +223,8 @@ class TuneConfig(Frozen):
         Raises
         ------
         ValueError
-            for an unknown task or disturbance, or a scenario that the batch plant or the law cannot run.
+            for an unknown task or disturbance, one that must not tune
+            (:mod:`baselines.runs.splits`), or a scenario that the batch plant or the law cannot run.
         """
         made = {}
         for task in self.tasks:
@@ -239,6 +241,7 @@ class TuneConfig(Frozen):
                     raise ValueError(
                         f"task {task!r} must have action 'twist', observation 'tracking'"
                     )
+                check_training(scenario)
                 made[f"{task}, {disturbance}"] = scenario
         return made
 
