@@ -329,7 +329,9 @@ def bench(
     ] = None,
     trust: Annotated[
         bool,
-        typer.Option("--trust", help="Load SB3 .zip files; loading runs code that they contain."),
+        typer.Option(
+            "--trust", help="Load SB3 .zip files and run entries' programs: code that they contain."
+        ),
     ] = False,
     plan: Annotated[
         str | None,
@@ -339,6 +341,13 @@ def bench(
             "precedence.",
             is_eager=True,
             callback=take_plan,
+        ),
+    ] = None,
+    entry: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder of a competition's entry, with entry.yaml; may be repeated. Without --policies only "
+            "the entries run.",
         ),
     ] = None,
     test: Annotated[
@@ -363,10 +372,13 @@ def bench(
     ] = False,
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
+    names = listed(policies)
+    if entry:
+        names = (*(names if given(ctx, "policies") else ()), *(f"entry:{one}" for one in entry))
     if test or test_seed is not None:
         refuse_beside_test(ctx)
         bench_test(
-            listed(policies),
+            names,
             seeds if given(ctx, "seeds") else None,
             test_seed,
             trust=trust,
@@ -384,7 +396,7 @@ def bench(
 
     path, values = parse_sweep(sweep) if sweep else (None, ())
     asked = Plan(
-        policies=listed(policies),
+        policies=names,
         tasks=listed(tasks),
         disturbances=tuple(disturbance_presets())
         if disturbances == "all"

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from baselines.benchmark.page import number, policy_label, span
+from baselines.benchmark.page import number, policy_label, span, time_table
 from baselines.benchmark.results import BOARD_FILE, PAGE_FILE, Results
 from baselines.benchmark.testset_score import CAP_MM, LEAST_MM, board_of_test
 from tlf_env.common.files import atomic
@@ -61,7 +61,7 @@ def markdown(board: dict[str, Any]) -> str:
         f"| {policy_label(row)} | {' | '.join(_share(one) for one in row['held_by_severity'])} |"
         for row in board["entries"]
     ]
-    parts += ["", *_differences(board), *_looks(board)]
+    parts += ["", *time_table(board["entries"]), *_differences(board), *_looks(board)]
     return "\n".join(parts)
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 from scipy.stats import binomtest, wilcoxon
 
-from baselines.benchmark.lines import Line, worst
+from baselines.benchmark.lines import Line, step_times, worst
 from baselines.benchmark.results import Results
 from baselines.benchmark.statistics import interval, median, rate
 from baselines.benchmark.testset import severity_of
@@ -101,6 +101,7 @@ def entry_table(policy: str, lines: Sequence[Line], severities: dict[int, float]
             metric: median([_combined(line, metric, how) for line in lines])
             for metric, how in BESIDE.items()
         },
+        **({"step_ms": times} if (times := step_times(lines)) else {}),
     }
 
 

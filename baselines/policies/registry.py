@@ -12,9 +12,11 @@ from pydantic import BaseModel
 
 from baselines.policies.card import WEIGHTS
 from baselines.policies.classical import CLASSICAL, Memoryless, make_classical
+from baselines.policies.entries import EntryPolicy, make_entry
 from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.systems import (
+    ENTRY,
     LimitedLaw,
     make_system,
     parse_system,
@@ -65,9 +67,10 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
         ``:PARAMETERS``, a preset or the path of a ``.yaml`` file), a system
         ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the name of a shipped learned policy, the
         path of a ``.safetensors`` file (with its card in the same folder), ``module:factory`` of an
-        object with SB3's ``predict``, or the path of an SB3 ``.zip`` file.
+        object with SB3's ``predict``, ``entry:FOLDER`` of a competition's entry, or the path of an SB3
+        ``.zip`` file.
     trust
-        Allow an SB3 ``.zip`` file: loading one runs code that it contains.
+        Allow an SB3 ``.zip`` file and an entry's program: both run code that is in them.
 
     Raises
     ------
@@ -115,6 +118,8 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
         scenario = fitted if asked else scenario
     if isinstance(policy, LearnedPolicy):
         policy.bind(name, scenario)
+    elif isinstance(policy, EntryPolicy):
+        policy.bind(scenario)
     return FittedPolicy(policy, scenario, asked)
 
 
@@ -159,6 +164,8 @@ def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
 
 
 def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
+    if name.startswith(ENTRY):
+        return make_entry(name, scenario, trust=trust)
     if name.lower().endswith(".zip"):
         return _stable_baselines(Path(name), scenario, trust=trust)
     if name.lower().endswith(WEIGHTS) or name in shipped_policies():
@@ -178,7 +185,7 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])
     raise ValueError(
-        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, FILE.zip"
+        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, {ENTRY}FOLDER, FILE.zip"
     )
 
 
@@ -218,7 +225,7 @@ def _hashed_content(path: Path) -> bytes:
 
 def _source_files(policy: Policy) -> list[Path]:
     """A learned policy's weights and card, or the file of the class and the controller file, if any."""
-    if isinstance(policy, LearnedPolicy):
+    if isinstance(policy, LearnedPolicy | EntryPolicy):
         return list(policy.files)
     try:
         source = inspect.getsourcefile(type(policy))

@@ -38,6 +38,7 @@ from tlf_env.task.actions import ACTION_SIZE, twist_action
 from tlf_env.task.scenario import Scenario
 
 FORM = "CONTROLLER+ESTIMATOR or CONTROLLER+ESTIMATOR+LIMITER"
+ENTRY = "entry:"  # before the folder of a competition's entry
 NOT_LIMITED = (".zip", ".safetensors")  # learned policies, whose paths may contain a +
 
 
@@ -84,7 +85,7 @@ def parse_system(name: str) -> SystemName | None:
     ValueError
         naming the part, if the name has a ``+`` and no estimator behind it, or a part is empty.
     """
-    if "+" not in name or name.lower().endswith(NOT_LIMITED):
+    if "+" not in name or name.lower().endswith(NOT_LIMITED) or name.startswith(ENTRY):
         return None
     kinds = "|".join(map(re.escape, ESTIMATOR_KINDS))
     found = re.match(rf"(?P<controller>.*?)\+(?P<estimator>{kinds})(?:\+(?P<limiter>.*))?$", name)
