@@ -73,7 +73,7 @@ def run(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="ekf (the paper's), ekf-slip, truth (the true pose and slip), or module:factory."
+            help="ekf (the paper's), ekf-slip, ekf-gyro, truth (the true pose and slip), or module:factory."
         ),
     ] = None,
     wheel_loop: Annotated[str | None, typer.Option(help="Own wheel loop, module:factory.")] = None,
