@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from baselines.policies.card import WEIGHTS
-from baselines.policies.classical import CLASSICAL, Memoryless, make_classical
+from baselines.policies.laws.catalogue import LAWS, make_law
+from baselines.policies.laws.law import Law
 from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.systems import (
@@ -171,9 +172,9 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     if head == "reference" and name != "reference:":
         check_interface(name, scenario, action="twist", observation="tracking")
         return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
-    if head in CLASSICAL:
+    if head in LAWS:
         check_interface(name, scenario, action="twist", observation="tracking")
-        return make_classical(head, tail, scenario.preview_s, scenario.rays)
+        return make_law(head, tail, scenario.preview_s, scenario.rays)
     if tail:
         return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])
@@ -224,9 +225,7 @@ def _source_files(policy: Policy) -> list[Path]:
         source = inspect.getsourcefile(type(policy))
     except TypeError:
         return []
-    made_from = (
-        policy.files if isinstance(policy, ReferencePolicy | Memoryless | LimitedLaw) else ()
-    )
+    made_from = policy.files if isinstance(policy, ReferencePolicy | Law | LimitedLaw) else ()
     return [Path(source), *made_from] if source else []
 
 

@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from baselines.policies.classical import FeedbackLinearisation, Kanayama, PurePursuit
+from baselines.policies.laws.textbook import FeedbackLinearisation, Kanayama, PurePursuit
 from baselines.policies.registry import fit_policy, make_policy
 from baselines.runs.run import run_policy
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
