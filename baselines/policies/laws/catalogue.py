@@ -10,6 +10,7 @@ from pydantic import ValidationError
 
 from baselines.policies.laws import law as shared
 from baselines.policies.laws.law import BOUNDS, ErrorBounds, Law, LawFile
+from baselines.policies.laws.linear_quadratic import LinearQuadratic, LinearQuadraticFile
 from baselines.policies.laws.textbook import (
     FeedbackLinearisation,
     FeedbackLinearisationFile,
@@ -26,6 +27,7 @@ LAWS: dict[str, tuple[type[Law], type[LawFile]]] = {
     "pure_pursuit": (PurePursuit, PurePursuitFile),
     "feedback_linearisation": (FeedbackLinearisation, FeedbackLinearisationFile),
     "kanayama": (Kanayama, KanayamaFile),
+    "lqr": (LinearQuadratic, LinearQuadraticFile),
 }
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from pathlib import Path
@@ -47,6 +48,19 @@ def _bounded(errors: np.ndarray, bounds: TwistLimitsRow) -> None:
     for i in range(errors.shape[0]):
         errors[i, 0] = saturated(braked(errors[i, 0], bounds.braking_error), bounds.forward_error)
         errors[i, 1] = saturated(errors[i, 1], bounds.lateral_error)
+
+
+@driver
+def _angles(sines: np.ndarray, cosines: np.ndarray, out: np.ndarray) -> None:
+    for i in range(out.shape[0]):
+        out[i] = math.atan2(sines[i], cosines[i])
+
+
+def angles(sines: np.ndarray, cosines: np.ndarray) -> np.ndarray:
+    """Angles (rad) of sines and cosines, with the same bits for a row in every batch."""
+    out = np.empty(len(sines))
+    _angles(np.ascontiguousarray(sines), np.ascontiguousarray(cosines), out)
+    return out
 
 
 class Law(ABC):
