@@ -2,7 +2,8 @@
 
 ``python docs/figures/make_systems.py`` drives 8 seeds of each cell for 60 s on the batch plant; it takes about
 a quarter of an hour on one core and needs no extra. ``--seeds N`` drives more. ``--rivals`` makes the table of
-the rivals instead, on seeds for choosing and with the processor time of each law; ``--rivals LAW`` only its rows.
+the rivals instead, on seeds for choosing and with the processor time of each law; ``--rivals LAW`` only its
+rows.
 """
 
 from __future__ import annotations
@@ -81,7 +82,7 @@ class Timed:
 
 
 def microseconds(name: str) -> str:
-    """Processor time of a law for each robot and step of five robots: the median and the 99th percentile of steps."""
+    """Processor time for each robot and step of five robots: the median and the 99th percentile of steps."""
     robots = 5
     scenario = load_scenario("infinity", robots=robots, horizon_s=20.0, plant="batch")
     fitted = fit_policy(name, scenario)

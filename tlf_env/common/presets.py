@@ -29,6 +29,7 @@ KINDS = {
     "feedback_linearisation": "laws/feedback_linearisation",
     "kanayama": "laws/kanayama",
     "lqr": "laws/lqr",
+    "sliding_mode": "laws/sliding_mode",
 }  # kinds of preset, and the subfolder of each
 SUFFIXES = (".yaml", ".yml")
 MOST_LEVELS = 50  # of mappings and lists in each other

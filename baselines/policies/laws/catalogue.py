@@ -11,6 +11,7 @@ from pydantic import ValidationError
 from baselines.policies.laws import law as shared
 from baselines.policies.laws.law import BOUNDS, ErrorBounds, Law, LawFile
 from baselines.policies.laws.linear_quadratic import LinearQuadratic, LinearQuadraticFile
+from baselines.policies.laws.sliding_mode import SlidingMode, SlidingModeFile
 from baselines.policies.laws.textbook import (
     FeedbackLinearisation,
     FeedbackLinearisationFile,
@@ -28,6 +29,7 @@ LAWS: dict[str, tuple[type[Law], type[LawFile]]] = {
     "feedback_linearisation": (FeedbackLinearisation, FeedbackLinearisationFile),
     "kanayama": (Kanayama, KanayamaFile),
     "lqr": (LinearQuadratic, LinearQuadraticFile),
+    "sliding_mode": (SlidingMode, SlidingModeFile),
 }
 
 
