@@ -10,7 +10,7 @@ from baselines.policies.laws.catalogue import make_law
 from baselines.policies.laws.linear_quadratic import LinearQuadratic
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
-from tlf_env.task.scenario import DEFAULT_PREVIEW_S
+from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
 
 ENTRIES = tracking_entries(DEFAULT_PREVIEW_S)
 B = -np.array([[1.0, 0.0], [0.0, 0.0], [0.0, 1.0]])
@@ -125,4 +125,4 @@ def test_a_horizon_shorter_than_a_step_is_refused(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("horizon_s: 0.01")
     with pytest.raises(ValueError, match=r"^horizon_s 0\.01 must be at least step_s 0\.03$"):
-        make_law("lqr", str(path), DEFAULT_PREVIEW_S, None)
+        make_law("lqr", str(path), load_scenario())

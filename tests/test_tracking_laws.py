@@ -15,6 +15,7 @@ from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
 
+SCENARIO = load_scenario()
 ENTRIES = tracking_entries(DEFAULT_PREVIEW_S)
 NEEDS: dict[str, str] = {}  # the package of an extra that a law needs
 TWISTS = [(400.0, 0.0), (300.0, 0.5), (250.0, -0.8), (0.0, 0.0)]
@@ -39,7 +40,7 @@ every_law = pytest.mark.parametrize("name", params(LAWS))
 
 
 def law(name, parameters=""):
-    return make_law(name, parameters, DEFAULT_PREVIEW_S, None)
+    return make_law(name, parameters, SCENARIO)
 
 
 def ahead(u_1, u_2, time_s):

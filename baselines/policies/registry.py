@@ -174,7 +174,7 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
     if head in LAWS:
         check_interface(name, scenario, action="twist", observation="tracking")
-        return make_law(head, tail, scenario.preview_s, scenario.rays)
+        return make_law(head, tail, scenario)
     if tail:
         return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])

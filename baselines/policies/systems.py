@@ -242,7 +242,7 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
         policy = ReferencePolicy(whole, period_s, preview_s)
         files += [] if path is None else [path]
     else:
-        made = make_law(head, tail, preview_s, scenario.rays)
+        made = make_law(head, tail, scenario)
         policy = LimitedLaw(made, limiter or Limiter(), period_s, preview_s)
         files += [Path(inspect.getfile(type(made))), *made.files]
     policy.files = tuple(files)

@@ -30,6 +30,7 @@ KINDS = {
     "kanayama": "laws/kanayama",
     "lqr": "laws/lqr",
     "sliding_mode": "laws/sliding_mode",
+    "adrc": "laws/adrc",
 }  # kinds of preset, and the subfolder of each
 SUFFIXES = (".yaml", ".yml")
 MOST_LEVELS = 50  # of mappings and lists in each other

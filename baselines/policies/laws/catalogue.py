@@ -9,6 +9,10 @@ from typing import Any
 from pydantic import ValidationError
 
 from baselines.policies.laws import law as shared
+from baselines.policies.laws.disturbance_rejection import (
+    DisturbanceRejection,
+    DisturbanceRejectionFile,
+)
 from baselines.policies.laws.law import BOUNDS, ErrorBounds, Law, LawFile
 from baselines.policies.laws.linear_quadratic import LinearQuadratic, LinearQuadraticFile
 from baselines.policies.laws.sliding_mode import SlidingMode, SlidingModeFile
@@ -22,7 +26,7 @@ from baselines.policies.laws.textbook import (
 )
 from tlf_env.common.errors import one_line
 from tlf_env.common.presets import preset_names, preset_or_file, read_preset_or_file
-from tlf_env.onboard.rays import Rays
+from tlf_env.task.scenario import Scenario
 
 LAWS: dict[str, tuple[type[Law], type[LawFile]]] = {
     "pure_pursuit": (PurePursuit, PurePursuitFile),
@@ -30,6 +34,7 @@ LAWS: dict[str, tuple[type[Law], type[LawFile]]] = {
     "kanayama": (Kanayama, KanayamaFile),
     "lqr": (LinearQuadratic, LinearQuadraticFile),
     "sliding_mode": (SlidingMode, SlidingModeFile),
+    "adrc": (DisturbanceRejection, DisturbanceRejectionFile),
 }
 
 
@@ -55,8 +60,8 @@ def read_law(law: str, parameters: str) -> LawFile:
         raise ValueError(f"{parameters}: {one_line(error, model)}") from error
 
 
-def law_of(law: str, file: LawFile, preview_s: tuple[float, ...], rays: Rays | None) -> Law:
-    """A law of :data:`LAWS` with its parameters, for a scenario's previews and rays.
+def law_of(law: str, file: LawFile, scenario: Scenario) -> Law:
+    """A law of :data:`LAWS` with its parameters, for a scenario's previews, rays and control period.
 
     Raises
     ------
@@ -65,13 +70,14 @@ def law_of(law: str, file: LawFile, preview_s: tuple[float, ...], rays: Rays | N
     """
     given: dict[str, Any] = file.model_dump(exclude_none=True, exclude={"found"})
     bounds = ErrorBounds(**{name: given.pop(name) for name in BOUNDS if name in given})
-    made = LAWS[law][0](preview_s, rays=rays, bounds=bounds, **given)
+    made = LAWS[law][0](scenario.preview_s, rays=scenario.rays, bounds=bounds, **given)
+    made.period_s = scenario.control_period_s
     made.files = (Path(inspect.getfile(shared)),)
     return made
 
 
-def make_law(law: str, parameters: str, preview_s: tuple[float, ...], rays: Rays | None) -> Law:
-    """A law by its name.
+def make_law(law: str, parameters: str, scenario: Scenario) -> Law:
+    """A law by its name, for a scenario's previews, rays and control period.
 
     Parameters
     ----------
@@ -85,7 +91,7 @@ def make_law(law: str, parameters: str, preview_s: tuple[float, ...], rays: Rays
     ValueError
         as :func:`read_law` and :func:`law_of`.
     """
-    made = law_of(law, read_law(law, parameters), preview_s, rays)
+    made = law_of(law, read_law(law, parameters), scenario)
     path = preset_or_file(law, parameters)
     made.files += () if path is None else (path,)
     return made

@@ -22,6 +22,7 @@ from tlf_env.onboard.limiter import (
 from tlf_env.onboard.rays import Rays
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
+from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S
 
 
 class ErrorBounds(Frozen):
@@ -68,13 +69,17 @@ class Law(ABC):
 
     Besides the entries of the observation, a law sees for each robot
 
+    - ``whole_e_1``, ``whole_e_2``: the position errors without bounds; ``e_1`` and ``e_2`` are bounded.
+    - ``present_u_1``, ``present_u_2``: the reference's twist without lead.
     - ``granted_u_1``, ``granted_u_2``: the part of its last wanted twist that was commanded, mm/s and
       rad/s. Where the limiter subtracts the slip, that is the last command plus the estimated slip.
+    - ``turned_u_1``, ``turned_u_2``: the part that the wheels turned, likewise from the odometry.
     - ``left_slip_1``, ``left_slip_2``: the estimated slip that nothing behind the law subtracts.
     """
 
     privileged = False
     scenario_overrides: Mapping[str, Any] = {}  # scenario fields that it asks for
+    period_s = DEFAULT_CONTROL_PERIOD_S  # control period, for laws with a memory
     files: tuple[Path, ...] = ()  # what it is made from, besides the file of its class
 
     def __init__(
@@ -133,10 +138,12 @@ class Law(ABC):
             )
         rows = (np.atleast_2d(observation) * self.scales).T
         seen = {name: rows[i] for name, i in self._places.items()}
+        seen["whole_e_1"], seen["whole_e_2"] = seen["e_1"], seen["e_2"]
         if self._bounds is not None:
             errors = np.stack([seen["e_1"], seen["e_2"]], axis=-1)
             _bounded(errors, self._bounds)
             seen["e_1"], seen["e_2"] = errors.T
+        seen["present_u_1"], seen["present_u_2"] = seen["reference_u_1"], seen["reference_u_2"]
         if lead_s:
             later = f"in_{self._preview_s[0]:g}_s"
             share = lead_s / self._preview_s[0]
@@ -146,6 +153,8 @@ class Law(ABC):
         for i in (1, 2):
             command, slip = seen[f"command_u_{i}"], seen[f"slip_{i}"]
             seen[f"granted_u_{i}"] = command + slip if slip_cancelled else command
+            odometry = seen[f"odometry_u_{i}"]
+            seen[f"turned_u_{i}"] = odometry + slip if slip_cancelled else odometry
             seen[f"left_slip_{i}"] = np.zeros_like(slip) if slip_cancelled else slip
         twist, state = self.advance(seen, state, episode_start)
         return np.stack(twist, axis=-1), state
