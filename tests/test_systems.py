@@ -4,6 +4,7 @@ import math
 
 import numpy as np
 import pytest
+from helpers import installed
 
 from baselines import ReferencePolicy
 from baselines.benchmark.page import policy_label
@@ -134,7 +135,9 @@ def test_a_lead_needs_a_preview():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("name", [one for one in policy_names() if one != "reference:tuned"])
+@pytest.mark.parametrize(
+    "name", installed(one for one in policy_names() if one != "reference:tuned")
+)
 def test_without_a_limiter_the_laws_twist_is_commanded(name, dtype):
     alone = make_policy(name, SCENARIO).predict(rows(dtype))[0]
     system = make_policy(f"{name}+ekf+none", SCENARIO).predict(rows(dtype))[0]

@@ -1,10 +1,10 @@
 """What holds for every tracking law: exact on an exact reference, mirrored, row by row, with its state."""
 
-import importlib.util
 import math
 
 import numpy as np
 import pytest
+from helpers import installed
 
 from baselines.policies.laws.catalogue import LAWS, make_law
 from baselines.policies.laws.law import Remembering
@@ -17,26 +17,13 @@ from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
 
 SCENARIO = load_scenario()
 ENTRIES = tracking_entries(DEFAULT_PREVIEW_S)
-NEEDS: dict[str, str] = {}  # the package of an extra that a law needs
-TWISTS = [(400.0, 0.0), (300.0, 0.5), (250.0, -0.8), (0.0, 0.0)]
+TOLERANCE = {"nmpc": 0.05}  # it predicts by Simpson's rule
+TWISTS = [(400.0, 0.0), (300.0, 0.5), (200.0, -0.8), (0.0, 0.0)]
 # Entries that change sign if left and right are exchanged.
 ODD = ("e_2", "sin_", "_u_2", "u_2_", "right", "slip_2", "action_1")
 
 
-def params(laws):
-    return [
-        pytest.param(
-            law,
-            marks=pytest.mark.skipif(
-                law in NEEDS and importlib.util.find_spec(NEEDS[law]) is None,
-                reason=f"{NEEDS.get(law)} is not installed",
-            ),
-        )
-        for law in laws
-    ]
-
-
-every_law = pytest.mark.parametrize("name", params(LAWS))
+every_law = pytest.mark.parametrize("name", installed(LAWS))
 
 
 def law(name, parameters=""):
@@ -84,7 +71,7 @@ def test_without_error_the_twist_is_the_references(name, twist):
     for _ in range(3):
         action, state = made.predict(on_the_reference(*twist), state)
         found = action * (FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S)
-        assert found == pytest.approx(twist, abs=1e-6)
+        assert found == pytest.approx(twist, abs=TOLERANCE.get(name, 1e-6))
     if not isinstance(made, Remembering):
         assert state == "memory"
 
@@ -156,10 +143,10 @@ def test_a_bad_parameter_is_reported_in_one_line(name, tmp_path):
             law(name, str(path))
 
 
-@pytest.mark.parametrize("name", params(LAWS))
+@pytest.mark.parametrize("name", installed(LAWS))
 def test_behind_the_limits_of_the_body_a_law_with_bounded_errors_holds_the_infinity(name):
     assert "bounded" in preset_names(name)
-    scenario = load_scenario("infinity", horizon_s=20.0, plant="batch")
+    scenario = load_scenario("infinity", robots=2, horizon_s=18.0, plant="batch")
     fitted = fit_policy(f"{name}:bounded+ekf-slip+body", scenario)
     record = run_policy(fitted.scenario, fitted.policy, 10_000)
     assert not any(metrics.lost or metrics.touched for metrics in record.metrics())

@@ -114,6 +114,8 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
         }
         asked = {field: _plain(value) for field, value in differing.items()}
         scenario = fitted if asked else scenario
+        if "preview_s" in asked and isinstance(policy, Law | LimitedLaw):
+            policy = _made(name, scenario, trust=trust)  # a law is made for the previews
     if isinstance(policy, LearnedPolicy):
         policy.bind(name, scenario)
     return FittedPolicy(policy, scenario, asked)

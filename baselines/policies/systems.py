@@ -211,9 +211,9 @@ class LimitedLaw:
 def make_system(system: SystemName, scenario: Scenario) -> Policy:
     """The policy of a system, for a scenario with ``tracking`` observations and ``twist`` actions.
 
-    Its ``scenario_overrides`` ask for the estimator, with the scenario's parameters whatever the
-    controller's file has, so that all controllers are compared on the same filter. A system on the true
-    state is privileged.
+    Its ``scenario_overrides`` ask for what the law asks for, and for the estimator, with the scenario's
+    parameters whatever the controller's file has, so that all controllers are compared on the same filter.
+    A system on the true state is privileged.
 
     Raises
     ------
@@ -235,6 +235,7 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
     if not known or (path is None and system.controller != head):
         raise _unknown(name, "controller", system.controller, system_controllers())
     policy: ReferencePolicy | LimitedLaw
+    asked: Mapping[str, Any] = {}
     period_s, preview_s = scenario.control_period_s, scenario.preview_s
     if kind == "controller":
         law = controller(tail or "consistent")
@@ -244,10 +245,11 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
     else:
         made = make_law(head, tail, scenario)
         policy = LimitedLaw(made, limiter or Limiter(), period_s, preview_s)
+        asked = made.scenario_overrides
         files += [Path(inspect.getfile(type(made))), *made.files]
     policy.files = tuple(files)
     policy.privileged = system.estimator == "truth"
-    policy.scenario_overrides = {"estimator": system.estimator}
+    policy.scenario_overrides = {**asked, "estimator": system.estimator}
     return policy
 
 

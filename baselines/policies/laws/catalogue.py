@@ -15,6 +15,7 @@ from baselines.policies.laws.disturbance_rejection import (
 )
 from baselines.policies.laws.law import BOUNDS, ErrorBounds, Law, LawFile
 from baselines.policies.laws.linear_quadratic import LinearQuadratic, LinearQuadraticFile
+from baselines.policies.laws.predictive import Predictive, PredictiveFile
 from baselines.policies.laws.sliding_mode import SlidingMode, SlidingModeFile
 from baselines.policies.laws.textbook import (
     FeedbackLinearisation,
@@ -35,6 +36,7 @@ LAWS: dict[str, tuple[type[Law], type[LawFile]]] = {
     "lqr": (LinearQuadratic, LinearQuadraticFile),
     "sliding_mode": (SlidingMode, SlidingModeFile),
     "adrc": (DisturbanceRejection, DisturbanceRejectionFile),
+    "nmpc": (Predictive, PredictiveFile),
 }
 
 
