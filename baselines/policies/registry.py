@@ -62,11 +62,10 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     ----------
     name
         ``reference`` or ``reference:GAINS``, where GAINS is a preset or the path of a controller file
-        (``.yaml``), ``pure_pursuit``, ``feedback_linearisation`` or ``kanayama`` (each also with
-        ``:PARAMETERS``, a preset or the path of a ``.yaml`` file), a system
-        ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the name of a shipped learned policy, the
-        path of a ``.safetensors`` file (with its card in the same folder), ``module:factory`` of an
-        object with SB3's ``predict``, or the path of an SB3 ``.zip`` file.
+        (``.yaml``), a law of :data:`LAWS` such as ``kanayama`` (each also with ``:PARAMETERS``, a preset or
+        the path of a ``.yaml`` file), a system ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the
+        name of a shipped learned policy, the path of a ``.safetensors`` file (with its card in the same
+        folder), ``module:factory`` of an object with SB3's ``predict``, or the path of an SB3 ``.zip`` file.
     trust
         Allow an SB3 ``.zip`` file: loading one runs code that it contains.
 
