@@ -59,9 +59,9 @@ def run(
         str,
         typer.Option(
             help="reference[:GAINS], reference:FILE.yaml, pure_pursuit, feedback_linearisation, kanayama, "
-            "CONTROLLER+ESTIMATOR+LIMITER of these (e.g. kanayama+ekf-slip+body), the name of a shipped "
-            "policy, FILE.safetensors (with FILE.json), module:factory, FILE.zip "
-            "(with --trust)."
+            "lqr, sliding_mode, adrc, nmpc, CONTROLLER+ESTIMATOR+LIMITER of these (e.g. "
+            "kanayama+ekf-slip+body), the name of a shipped policy, FILE.safetensors (with FILE.json), "
+            "module:factory, FILE.zip (with --trust)."
         ),
     ] = "reference",
     gains: Annotated[
@@ -562,7 +562,9 @@ def train(
 
 @app.command()
 def tune(
-    config: Annotated[str, typer.Argument(help="Search: a preset (tuned) or a YAML file.")],
+    config: Annotated[
+        str, typer.Argument(help="Search: a preset (tuned, or a law) or a YAML file.")
+    ],
     trials: Annotated[
         int | None, typer.Option(help="Number of trials, including those of earlier calls.")
     ] = None,
@@ -582,11 +584,11 @@ def tune(
         bool, typer.Option("--json", help="Print the result as JSON instead of the table.")
     ] = False,
 ) -> None:
-    """Search a controller's gains, limits and filter. Interrupt it, and call it again to continue."""
+    """Search a controller's or a law's numbers. Interrupt it, and call it again to continue."""
     from baselines.runs.provenance import command_line
     from baselines.tables import tune_table
     from baselines.tuning.config import load_tune
-    from baselines.tuning.search import RESULT_FILE, run_tune
+    from baselines.tuning.search import RESULT_FILE, run_tune, use_of
 
     search = load_tune(config, trials=trials)
     folder = out or Path("results") / "tune" / Path(config).stem
@@ -606,7 +608,9 @@ def tune(
         return
     screen.print(tune_table(result["found"]))
     screen.print(f"In {folder}: {RESULT_FILE}; run it with", soft_wrap=True)
-    screen.print(f"tlf run {search.tasks[0]} --gains {folder / RESULT_FILE}", soft_wrap=True)
+    use = use_of(search, folder)
+    how = use.replace("reference:", "--gains ", 1) if "+" not in use else f"--policy {use}"
+    screen.print(f"tlf run {search.tasks[0]} {how}", soft_wrap=True)
 
 
 def draw_bench(board: dict[str, Any], folder: Path) -> list[Path]:

@@ -11,8 +11,9 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from baselines.policies.card import WEIGHTS
-from baselines.policies.classical import CLASSICAL, Memoryless, make_classical
 from baselines.policies.entries import EntryPolicy, make_entry
+from baselines.policies.laws.catalogue import LAWS, make_law
+from baselines.policies.laws.law import Law
 from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.systems import (
@@ -63,12 +64,11 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     ----------
     name
         ``reference`` or ``reference:GAINS``, where GAINS is a preset or the path of a controller file
-        (``.yaml``), ``pure_pursuit``, ``feedback_linearisation`` or ``kanayama`` (each also with
-        ``:PARAMETERS``, a preset or the path of a ``.yaml`` file), a system
-        ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the name of a shipped learned policy, the
-        path of a ``.safetensors`` file (with its card in the same folder), ``module:factory`` of an
-        object with SB3's ``predict``, ``entry:FOLDER`` of a competition's entry, or the path of an SB3
-        ``.zip`` file.
+        (``.yaml``), a law of :data:`LAWS` such as ``kanayama`` (each also with ``:PARAMETERS``, a preset or
+        the path of a ``.yaml`` file), a system ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the
+        name of a shipped learned policy, the path of a ``.safetensors`` file (with its card in the same
+        folder), ``module:factory`` of an object with SB3's ``predict``, ``entry:FOLDER`` of a
+        competition's entry, or the path of an SB3 ``.zip`` file.
     trust
         Allow an SB3 ``.zip`` file and an entry's program: both run code that is in them.
 
@@ -116,6 +116,8 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
         }
         asked = {field: _plain(value) for field, value in differing.items()}
         scenario = fitted if asked else scenario
+        if "preview_s" in asked and isinstance(policy, Law | LimitedLaw):
+            policy = _made(name, scenario, trust=trust)  # a law is made for the previews
     if isinstance(policy, LearnedPolicy):
         policy.bind(name, scenario)
     elif isinstance(policy, EntryPolicy):
@@ -178,9 +180,9 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     if head == "reference" and name != "reference:":
         check_interface(name, scenario, action="twist", observation="tracking")
         return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
-    if head in CLASSICAL:
+    if head in LAWS:
         check_interface(name, scenario, action="twist", observation="tracking")
-        return make_classical(head, tail, scenario.preview_s, scenario.rays)
+        return make_law(head, tail, scenario)
     if tail:
         return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])
@@ -231,9 +233,7 @@ def _source_files(policy: Policy) -> list[Path]:
         source = inspect.getsourcefile(type(policy))
     except TypeError:
         return []
-    made_from = (
-        policy.files if isinstance(policy, ReferencePolicy | Memoryless | LimitedLaw) else ()
-    )
+    made_from = policy.files if isinstance(policy, ReferencePolicy | Law | LimitedLaw) else ()
     return [Path(source), *made_from] if source else []
 
 
