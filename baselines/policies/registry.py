@@ -18,6 +18,7 @@ from baselines.policies.learned import LearnedPolicy, load_policy, shipped_polic
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.systems import (
     ENTRY,
+    ESTIMATORS,
     LimitedLaw,
     make_system,
     parse_system,
@@ -39,6 +40,8 @@ OVERRIDABLE = (
     "residual_reach_mm",
     "estimator",
     "ekf_slip",
+    "ekf_gyro",
+    "broadcast_smoothing_s",
     "preview_s",
     "rays",
 )
@@ -156,12 +159,14 @@ def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
             f"policy {name!r}: scenario_overrides must map fields of {', '.join(OVERRIDABLE)}; "
             f"got {asked!r}"
         )
-    differs = parse_system(name) and scenario.estimator != asked["estimator"]
-    if differs and "estimator" in scenario.model_fields_set:
-        raise ValueError(
-            f"system {name!r} names the estimator {asked['estimator']!r}; the scenario sets "
-            f"{scenario.estimator!r}"
-        )
+    system = parse_system(name)
+    if system is not None:
+        for field, value in ESTIMATORS[system.estimator].items():
+            if field in scenario.model_fields_set and getattr(scenario, field) != value:
+                raise ValueError(
+                    f"system {name!r} names the {field} {value!r}; the scenario sets "
+                    f"{getattr(scenario, field)!r}"
+                )
     return {field: asked[field] for field in asked if field not in scenario.model_fields_set}
 
 
