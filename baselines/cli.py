@@ -297,6 +297,7 @@ def take_plan(ctx: typer.Context, plan: str | None) -> str | None:
 
 @app.command()
 def bench(
+    ctx: typer.Context,
     policies: Annotated[
         str, typer.Option(help="Names as in `tlf run --policy`, comma-separated.")
     ] = "reference:consistent,reference:printed,pure_pursuit,feedback_linearisation",
@@ -313,10 +314,26 @@ def bench(
     sweep: Annotated[
         str | None,
         typer.Option(
-            help="Run COUNT values of one disturbance parameter: PATH=FIRST:LAST:COUNT, e.g. "
-            "slip.delta_1_mm_s=0:40:9."
+            help="Run several values of a parameter of the disturbance or field of the scenario: "
+            "PATH=FIRST:LAST:COUNT, e.g. slip.delta_1_mm_s=0:40:9; PATH=FIRST:LAST:COUNT:log; or "
+            "PATH=VALUE,VALUE,..., e.g. robots=3,5,10."
         ),
     ] = None,
+    envelope: Annotated[
+        bool,
+        typer.Option(
+            "--envelope",
+            help="Search the largest level of each knob that 95 % of the runs hold, in place of running "
+            "--disturbances; --seeds is then 20000:20100 and --tasks infinity by default.",
+        ),
+    ] = False,
+    knobs: Annotated[
+        str,
+        typer.Option(help="Of --envelope, comma-separated: presets or FILE.yaml; or all."),
+    ] = "all",
+    resolution: Annotated[
+        float, typer.Option(help="Of --envelope: largest ratio of neighbouring levels, less 1.")
+    ] = 0.05,
     horizon_s: Annotated[float | None, typer.Option(help="Length of each run, s.")] = None,
     plant: Annotated[
         str | None,
@@ -347,6 +364,11 @@ def bench(
     ] = False,
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
+    if envelope:
+        from baselines.benchmark.envelope_command import bench_envelope
+
+        bench_envelope(ctx)
+        return
     from baselines.benchmark.bench import named_scenarios, run_bench
     from baselines.benchmark.plan import Plan, disturbance_presets, parse_seeds, parse_sweep
     from baselines.runs.provenance import command_line
