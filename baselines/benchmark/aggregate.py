@@ -16,7 +16,7 @@ import numpy as np
 
 from baselines.benchmark.comparisons import comparisons
 from baselines.benchmark.lines import Line, Strata, failures, run_score, stratum_of, worst
-from baselines.benchmark.page import markdown
+from baselines.benchmark.page import PAIRED, markdown
 from baselines.benchmark.results import BOARD_FILE, PAGE_FILE, PLAN_FILE, Results
 from baselines.benchmark.statistics import (
     crossing,
@@ -79,6 +79,7 @@ def leaderboard(results: Results, command: str = "") -> dict[str, Any]:
         "cells": cells,
         "profiles": {policy: profile(strata) for policy, strata in groups.items()},
         "comparisons": comparisons(groups, [row["policy"] for row in policies]),
+        "compared_by": PAIRED,
         "breaking_points": breaking_points(results, cells),
     }
 

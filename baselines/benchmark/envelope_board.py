@@ -225,7 +225,7 @@ def envelope_page(board: Mapping[str, Any], figures: Sequence[str] = ()) -> str:
         [
             "# Envelopes\n",
             f"Made by `{board['command']}`.\n",
-            f"{explanation(board)}\n",
+            f"{explanation(board)} Definitions: `docs/envelopes.md`.\n",
             *envelope_tables(board),
             "",
             f"{board['levels']} levels of up to {end - first} runs took "
@@ -255,7 +255,7 @@ def explanation(board: Mapping[str, Any]) -> str:
         "fails if a robot is lost or touches another. In brackets, the "
         f"{100 * CONFIDENCE:.0f} % interval of the level that {100 * HELD_SHARE:.0f} % of all seeds hold: "
         f"{ends[0]}; {ends[1]}. **Bold**: the largest of a row. ↕: a tested level above holds again. Score: "
-        "geometric mean of the envelopes in levels; definitions in `docs/envelopes.md`."
+        "geometric mean of the envelopes in levels."
     )
 
 
