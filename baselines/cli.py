@@ -365,7 +365,7 @@ def bench(
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
     if envelope:
-        from baselines.benchmark.envelope_command import bench_envelope
+        from baselines.envelope_command import bench_envelope
 
         bench_envelope(ctx)
         return

@@ -6,7 +6,7 @@ seed, do not fail. The envelope is the largest level that holds together with al
 All levels have the same seeds. If each seed fails from a level of its own on, the envelope is a quantile of
 these levels: the one that 5 % of the seeds have reached. Its interval is the distribution-free one of a
 quantile, between two order statistics, which are two more counts of failed seeds (G. J. Hahn and W. Q. Meeker,
-Statistical Intervals, 1991, section 5.2).
+Statistical Intervals, 1991, chapter 5).
 """
 
 from __future__ import annotations

@@ -37,9 +37,10 @@ def draw_envelopes(board: Mapping[str, Any]) -> Figure:
     height_in = MARGIN_IN + 0.2 * len(names) + len(tasks) * ROW_IN * len(knobs)
     figure = Figure(figsize=(WIDTH_IN, height_in), layout="constrained")
     first, end = board["plan"]["plan"]["seeds"]
+    few = " (too few seeds for a low end)" if board["counts"]["low"] is None else ""
     figure.suptitle(
-        f"largest level that {end - first - board['counts']['held']} of {end - first} runs hold, "
-        "with 95 % intervals",
+        f"largest level that {end - first - board['counts']['held']} of {end - first} runs hold, with 95 % "
+        f"intervals{few}",
         fontsize="medium",
     )
     panels = figure.subplots(len(tasks), 1, sharex=True, squeeze=False)[:, 0]

@@ -17,6 +17,7 @@ from make_board import DOCS
 from make_parts import put
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
+from matplotlib.ticker import NullLocator
 
 from baselines.benchmark.bench import run_bench
 from baselines.benchmark.envelope import EnvelopePlan, knob_presets
@@ -38,14 +39,15 @@ POLICIES = (
     "kanayama:bounded+ekf-slip+body",
 )
 FOLDER = DOCS / "envelopes"
-HORIZON_S, ROW_HORIZON_S = 60.0, 250.0
+HORIZON_S, ROW_HORIZON_S = 60.0, 240.0
 SMOOTH = (("start_ramp_s", 6.0),)
-FREQUENCIES = "frequency_hz=0.05:2:8:log"
-SLIPS = (  # file, path of the frequency, amplitude, label
-    ("sine-forward", "slip.delta_1_mm_s", 20.0, "position RMS per amplitude of δ₁ (mm per mm/s)"),
-    ("sine-yaw", "slip.delta_2_rad_s", 0.1, "position RMS per amplitude of δ₂ (mm per rad/s)"),
+FREQUENCIES = "frequency_hz=0.05:2:7:log"
+SLIPS = (  # file, path of the frequency, amplitude, title, unit of the gain
+    ("sine-forward", "slip.delta_1_mm_s", 20.0, "forward slip δ₁, 20 mm/s", "mm per mm/s"),
+    ("sine-yaw", "slip.delta_2_rad_s", 0.1, "yaw slip δ₂, 0.1 rad/s", "mm per rad/s"),
 )
-FRICTIONS = "tyre.friction_scale=1,0.8,0.6,0.5,0.45,0.4,0.35,0.3"
+TICKS_HZ = (0.05, 0.1, 0.2, 0.5, 1.0, 2.0)
+FRICTIONS = "tyre.friction_scale=1,0.7,0.5,0.45,0.4,0.35,0.3"
 ROWS = "robots=3,5,10,20"
 ROW_DISTURBANCES = ("nominal", "slip")
 LOST_SHARE = 0.05  # of runs; a cell with more has a hollow mark
@@ -113,11 +115,13 @@ class Curves:
         y: Sequence[float],
         hollow: Sequence[bool],
     ) -> None:
-        """A line with a mark at each point, hollow where it says so."""
+        """A line with a mark at each point, hollow where it says so; later systems are thinner, on top."""
         number = self.policies.index(policy)
         colour = hex_colour(number, len(self.policies))
         marker = MARKERS[number % len(MARKERS)]
-        axes.plot(x, y, color=colour, lw=1.4, label=policy, marker=marker, ms=5, mfc=colour)
+        under = 1 - number / len(self.policies)
+        lw, ms = 1.0 + 2.0 * under, 4.0 + 3.0 * under
+        axes.plot(x, y, color=colour, lw=lw, label=policy, marker=marker, ms=ms, mfc=colour)
         empty = np.array(hollow)
         axes.plot(
             np.array(x)[empty],
@@ -165,14 +169,17 @@ def two_panels() -> tuple[Figure, list[Axes]]:
 def slip_figure(curves: Curves) -> None:
     """Gain from slip to error against the frequency of the slip."""
     figure, panels = two_panels()
-    for axes, (name, path, amplitude, label) in zip(panels, SLIPS, strict=True):
+    for axes, (name, path, amplitude, title, unit) in zip(panels, SLIPS, strict=True):
         file = FOLDER / f"{name}.yaml"
         lines = curves.lines(name, f"{path}.{FREQUENCIES}", (str(file),), overrides=SMOOTH)
         curves.plot(axes, lines, lambda group, by=amplitude: middle(group) / by)
         axes.set_xscale("log")
         axes.set_yscale("log")
+        axes.set_xticks(TICKS_HZ, [f"{tick:g}" for tick in TICKS_HZ])
+        axes.xaxis.set_minor_locator(NullLocator())
+        axes.set_title(title, loc="left", fontsize="medium")
         axes.set_xlabel("frequency of the slip (Hz)")
-        axes.set_ylabel(label)
+        axes.set_ylabel(f"position RMS over amplitude ({unit})")
     save(figure, "slip", panels)
 
 
@@ -229,7 +236,7 @@ def envelopes(options: argparse.Namespace) -> None:
     plan = EnvelopePlan(
         options.policies,
         ("infinity",),
-        tuple(knob_presets()),
+        options.knobs,
         (FIRST_TABLE_SEED, FIRST_TABLE_SEED + options.seeds),
         horizon_s=HORIZON_S,
     )
@@ -259,12 +266,20 @@ PARTS: dict[str, Callable[[Curves], None]] = {
 }
 
 
+def names(text: str) -> tuple[str, ...]:
+    """Comma-separated names."""
+    return tuple(text.split(","))
+
+
 def main() -> None:
     """Drive and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20, help="of each level of the envelopes")
-    parser.add_argument("--curve-seeds", type=int, default=6, help="of each point of the curves")
-    parser.add_argument("--policies", type=lambda text: tuple(text.split(",")), default=POLICIES)
+    parser.add_argument("--curve-seeds", type=int, default=4, help="of each point of the curves")
+    parser.add_argument("--policies", type=names, default=POLICIES)
+    parser.add_argument(
+        "--knobs", type=names, default=tuple(knob_presets()), help="comma-separated"
+    )
     parser.add_argument("--parts", default=",".join(("envelope", *PARTS)), help="comma-separated")
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--out", type=Path, default=Path("results/envelopes"))
