@@ -314,10 +314,26 @@ def bench(
     sweep: Annotated[
         str | None,
         typer.Option(
-            help="Run COUNT values of one disturbance parameter: PATH=FIRST:LAST:COUNT, e.g. "
-            "slip.delta_1_mm_s=0:40:9."
+            help="Run several values of a parameter of the disturbance or field of the scenario: "
+            "PATH=FIRST:LAST:COUNT, e.g. slip.delta_1_mm_s=0:40:9; PATH=FIRST:LAST:COUNT:log; or "
+            "PATH=VALUE,VALUE,..., e.g. robots=3,5,10."
         ),
     ] = None,
+    envelope: Annotated[
+        bool,
+        typer.Option(
+            "--envelope",
+            help="Search the largest level of each knob that 95 % of the runs hold, in place of running "
+            "--disturbances; --seeds is then 20000:20100 and --tasks infinity by default.",
+        ),
+    ] = False,
+    knobs: Annotated[
+        str,
+        typer.Option(help="Of --envelope, comma-separated: presets or FILE.yaml; or all."),
+    ] = "all",
+    resolution: Annotated[
+        float, typer.Option(help="Of --envelope: largest ratio of neighbouring levels, less 1.")
+    ] = 0.05,
     horizon_s: Annotated[float | None, typer.Option(help="Length of each run, s.")] = None,
     plant: Annotated[
         str | None,
@@ -372,6 +388,11 @@ def bench(
     ] = False,
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
+    if envelope:
+        from baselines.envelope_command import bench_envelope
+
+        bench_envelope(ctx)
+        return
     names = listed(policies)
     if entry:
         names = (*(names if given(ctx, "policies") else ()), *(f"entry:{one}" for one in entry))

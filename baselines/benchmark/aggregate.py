@@ -24,7 +24,7 @@ from baselines.benchmark.lines import (
     stratum_of,
     worst,
 )
-from baselines.benchmark.page import markdown
+from baselines.benchmark.page import PAIRED, markdown
 from baselines.benchmark.results import BOARD_FILE, PAGE_FILE, PLAN_FILE, Results
 from baselines.benchmark.statistics import (
     crossing,
@@ -87,6 +87,7 @@ def leaderboard(results: Results, command: str = "") -> dict[str, Any]:
         "cells": cells,
         "profiles": {policy: profile(strata) for policy, strata in groups.items()},
         "comparisons": comparisons(groups, [row["policy"] for row in policies]),
+        "compared_by": PAIRED,
         "breaking_points": breaking_points(results, cells),
     }
 

@@ -11,6 +11,8 @@ from baselines.policies.registry import describe_overrides
 from baselines.policies.systems import parse_system
 
 MOST_LATE = 0.01  # share of late steps of an entry in real time
+# How `comparisons` are made; a leaderboard.json without the key `compared_by` has the second.
+PAIRED, OF_MEDIANS = "Medians of the differences", "Differences of medians"
 
 
 def markdown(board: dict[str, Any], figures: Sequence[str] = ()) -> str:
@@ -87,12 +89,13 @@ def figure_title(name: str) -> str:
 def comparison_tables(board: dict[str, Any]) -> list[str]:
     """Each entry against the best other policy: a sentence, and a row per task and disturbance."""
     parts = []
+    compared_by = board.get("compared_by", OF_MEDIANS)
     for policy in dict.fromkeys(row["policy"] for row in board["comparisons"]):
         rows = [row for row in board["comparisons"] if row["policy"] == policy]
         parts += [
             f"## {policy} against the best other policy\n",
             "The rival in each row is the other policy with the fewest failed runs there; among equals, the "
-            "one with the smallest median position RMS. Differences of medians over seeds (entry minus "
+            f"one with the smallest median position RMS. {compared_by} over seeds (entry minus "
             "rival, worst robot; torque: ratio); intervals resample seeds, for both policies together. "
             "**Bold**: significant difference (the interval excludes 0, or a ratio of 1).\n",
             f"Position RMS: {verdict(rows)}.\n",
