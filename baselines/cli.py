@@ -73,7 +73,7 @@ def run(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="ekf (the paper's), ekf-slip, truth (the true pose and slip), or module:factory."
+            help="ekf (the paper's), ekf-slip, ekf-gyro, truth (the true pose and slip), or module:factory."
         ),
     ] = None,
     wheel_loop: Annotated[str | None, typer.Option(help="Own wheel loop, module:factory.")] = None,
@@ -297,6 +297,7 @@ def take_plan(ctx: typer.Context, plan: str | None) -> str | None:
 
 @app.command()
 def bench(
+    ctx: typer.Context,
     policies: Annotated[
         str, typer.Option(help="Names as in `tlf run --policy`, comma-separated.")
     ] = "reference:consistent,reference:printed,pure_pursuit,feedback_linearisation",
@@ -313,10 +314,26 @@ def bench(
     sweep: Annotated[
         str | None,
         typer.Option(
-            help="Run COUNT values of one disturbance parameter: PATH=FIRST:LAST:COUNT, e.g. "
-            "slip.delta_1_mm_s=0:40:9."
+            help="Run several values of a parameter of the disturbance or field of the scenario: "
+            "PATH=FIRST:LAST:COUNT, e.g. slip.delta_1_mm_s=0:40:9; PATH=FIRST:LAST:COUNT:log; or "
+            "PATH=VALUE,VALUE,..., e.g. robots=3,5,10."
         ),
     ] = None,
+    envelope: Annotated[
+        bool,
+        typer.Option(
+            "--envelope",
+            help="Search the largest level of each knob that 95 % of the runs hold, in place of running "
+            "--disturbances; --seeds is then 20000:20100 and --tasks infinity by default.",
+        ),
+    ] = False,
+    knobs: Annotated[
+        str,
+        typer.Option(help="Of --envelope, comma-separated: presets or FILE.yaml; or all."),
+    ] = "all",
+    resolution: Annotated[
+        float, typer.Option(help="Of --envelope: largest ratio of neighbouring levels, less 1.")
+    ] = 0.05,
     horizon_s: Annotated[float | None, typer.Option(help="Length of each run, s.")] = None,
     plant: Annotated[
         str | None,
@@ -328,7 +345,9 @@ def bench(
     ] = None,
     trust: Annotated[
         bool,
-        typer.Option("--trust", help="Load SB3 .zip files; loading runs code that they contain."),
+        typer.Option(
+            "--trust", help="Load SB3 .zip files and run entries' programs: code that they contain."
+        ),
     ] = False,
     plan: Annotated[
         str | None,
@@ -340,13 +359,57 @@ def bench(
             callback=take_plan,
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("results/bench"),
+    entry: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder of a competition's entry, with entry.yaml; may be repeated. Without --policies only "
+            "the entries run.",
+        ),
+    ] = None,
+    test: Annotated[
+        bool,
+        typer.Option(
+            "--test",
+            help="Run the test set: cases with random tasks, robots and disturbances, 20000:20200 unless "
+            "--seeds has others. Every look is logged.",
+        ),
+    ] = False,
+    test_seed: Annotated[
+        str | None,
+        typer.Option(help="Run cases made from this text in place of the published test set."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the results; default results/bench or results/test."),
+    ] = None,
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print leaderboard.json instead of the tables.")
     ] = False,
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
+    if envelope:
+        from baselines.envelope_command import bench_envelope
+
+        bench_envelope(ctx)
+        return
+    names = listed(policies)
+    if entry:
+        names = (*(names if given(ctx, "policies") else ()), *(f"entry:{one}" for one in entry))
+    if test or test_seed is not None:
+        refuse_beside_test(ctx)
+        bench_test(
+            names,
+            seeds if given(ctx, "seeds") else None,
+            test_seed,
+            trust=trust,
+            out=out or Path("results/test"),
+            processes=processes or os.cpu_count() or 1,
+            ray=ray,
+            as_json=as_json,
+        )
+        return
+    out = out or Path("results/bench")
     from baselines.benchmark.bench import named_scenarios, run_bench
     from baselines.benchmark.plan import Plan, disturbance_presets, parse_seeds, parse_sweep
     from baselines.runs.provenance import command_line
@@ -354,7 +417,7 @@ def bench(
 
     path, values = parse_sweep(sweep) if sweep else (None, ())
     asked = Plan(
-        policies=listed(policies),
+        policies=names,
         tasks=listed(tasks),
         disturbances=tuple(disturbance_presets())
         if disturbances == "all"
@@ -388,6 +451,68 @@ def bench(
     else:
         screen.print(board_table(board))
         screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
+
+
+def given(ctx: typer.Context, option: str) -> bool:
+    """Whether an option has another source than its default: the command line or a plan."""
+    source = ctx.get_parameter_source(option)
+    return source is not None and source.name in ("COMMANDLINE", "DEFAULT_MAP")
+
+
+def refuse_beside_test(ctx: typer.Context) -> None:
+    """Refuse options that the cases of the test set have themselves.
+
+    Raises
+    ------
+    ValueError
+        naming the first option.
+    """
+    for option in ("tasks", "disturbances", "level", "sweep", "horizon_s", "plant"):
+        if given(ctx, option):
+            raise ValueError(
+                f"--{option.replace('_', '-')} cannot be used with --test: every case has its own"
+            )
+
+
+def bench_test(
+    policies: tuple[str, ...],
+    seeds: str | None,
+    test_seed: str | None,
+    *,
+    trust: bool,
+    out: Path,
+    processes: int,
+    ray: str | None,
+    as_json: bool,
+) -> None:
+    """Run entries on the test set, and write and print the tables."""
+    from baselines.benchmark.bench import run_bench
+    from baselines.benchmark.plan import parse_seeds
+    from baselines.benchmark.testset_page import write_test_board
+    from baselines.benchmark.testset_plan import PUBLISHED, log_look, plan_of_test
+    from baselines.runs.provenance import command_line
+    from baselines.tables import testset_table
+
+    if test_seed == "":
+        raise ValueError("--test-seed must not be empty")
+    cases = PUBLISHED if seeds is None else parse_seeds(seeds)
+    plan = plan_of_test(policies, cases, test_seed or "", trust=trust)
+    warn_of_compiling()
+    with progress_bar("test set") as update:
+        results = run_bench(
+            plan,
+            out,
+            processes=processes,
+            ray_address=ray,
+            progress=update,
+            begin=lambda: log_look(plan, out),
+        )
+    board = write_test_board(results, out, command_line(sys.argv[1:]))
+    if as_json:
+        typer.echo(json.dumps(board, indent=1, allow_nan=False))
+        return
+    screen.print(testset_table(board))
+    screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
 
 
 @app.command()

@@ -200,7 +200,7 @@ def test_a_paired_interval_is_narrow_where_seeds_explain_the_spread():
     theirs, mine = seeds, seeds - 2 + rng.normal(0, 0.1, 60)
     row = comparisons.comparison(runs("mine", mine), runs("theirs", theirs))
     found = row["position_rmse_mm"]
-    assert found["difference"] == pytest.approx(np.median(mine) - np.median(theirs))
+    assert found["difference"] == pytest.approx(np.median(mine - theirs))
     assert found["interval"][0] < -2 < found["interval"][1] < 0
     assert found["interval"][1] - found["interval"][0] < 1
     shuffled = comparisons.comparison(runs("mine", rng.permutation(mine)), runs("theirs", theirs))
@@ -239,6 +239,22 @@ def test_pairs_that_are_undefined_on_one_side_are_left_out():
     assert found == {"difference": 2, "interval": [2, 2]}
     assert statistics.paired([(None, 1.0)], "ratio") == {"ratio": None, "interval": None}
     assert page.compared({"ratio": None, "interval": None}, 2) == "–"
+
+
+def test_a_difference_is_the_median_of_the_pairs_not_the_difference_of_medians():
+    """Better on two seeds of three by a little, and by much on none: the medians say the opposite."""
+    pairs = [(1.0, 2.0), (10.0, 11.0), (12.0, 5.0)]
+    assert statistics.paired(pairs, "difference")["difference"] == -1.0
+    assert np.median([a for a, _ in pairs]) - np.median([b for _, b in pairs]) == 5.0
+    assert statistics.paired(pairs, "ratio")["ratio"] == pytest.approx(10 / 11)
+
+
+def test_an_older_board_says_how_it_was_compared(tmp_path):
+    lines = [*runs("learned", (5.0, 6.0)), *runs("pure_pursuit", (1.0, 2.0))]
+    board = aggregate.leaderboard(results(lines, tmp_path))
+    assert "Medians of the differences over seeds" in "\n".join(page.comparison_tables(board))
+    del board["compared_by"]
+    assert "Differences of medians over seeds" in "\n".join(page.comparison_tables(board))
 
 
 def test_a_difference_that_is_not_significant_is_not_bold():

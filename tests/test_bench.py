@@ -268,6 +268,33 @@ def test_a_sweep_runs_every_value():
     assert level.scenario(Episode("", "infinity", "ice", 1.0, 0.5, 0)).disturbance.level == 0.5
 
 
+def test_a_sweep_of_a_field_of_the_scenario_keeps_the_disturbance():
+    path, values = parse_sweep("robots=2,3,5")
+    assert (path, values) == ("robots", (2, 3, 5))
+    plan = Plan(**(vars(PLAN) | {"sweep": path, "sweep_values": values}))
+    episode = Episode("", "infinity", "start", 1.0, 5, 0)
+    same = load_scenario("infinity", disturbance="start", robots=5, horizon_s=2.0)
+    assert plan.scenario(episode) == same
+    nested = Plan(**(vars(plan) | {"sweep": "robot.mass_kg"}))
+    found = nested.scenario(episode._replace(sweep=1.5))
+    assert found.robot.mass_kg == 1.5
+    assert found.robot.wheel_radius_mm == same.robot.wheel_radius_mm
+    assert found.disturbance == same.disturbance
+    with pytest.raises(ValueError, match=r"robots.*2\.5"):
+        plan.scenario(episode._replace(sweep=2.5))
+
+
+def test_a_logarithmic_sweep_has_equal_ratios():
+    from baselines.benchmark.sweep_figure import is_geometric
+
+    _, values = parse_sweep("slip.delta_1_mm_s.frequency_hz=0.05:2:9:log")
+    assert (values[0], values[-1]) == (0.05, 2.0)
+    assert np.ptp(np.diff(np.log(values))) < 1e-4
+    assert is_geometric(values)
+    assert not is_geometric(parse_sweep("level=1:3:9")[1])
+    assert not is_geometric(parse_sweep("level=0:3:9")[1])
+
+
 def test_a_sweep_reports_the_breaking_points(tmp_path):
     plan = Plan(
         ("reference:consistent",), ("infinity",), ("nominal",), (0, 2), overrides=(("horizon_s", 20.0),),

@@ -12,6 +12,7 @@ import yaml
 from hypothesis import example, given
 from hypothesis import strategies as st
 
+from baselines.benchmark.envelope import load_knob
 from baselines.benchmark.plan import read_plan
 from baselines.policies.learned import SHIPPED, load_policy, shipped_policies
 from baselines.runs.jobs import claim
@@ -30,6 +31,7 @@ READERS = {
     "controller": load_controller,
     "training": load_config,
     "search": load_tune,
+    "knob": lambda path: load_knob(str(path)),
     "plan": lambda path: read_plan(str(path), ("seeds", "level", "policies")),
 }
 NUMBERS = {

@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
 from tlf_env.common.errors import one_line
+from tlf_env.common.presets import preset_names
 from tlf_env.physics.openloop import OpenLoopInput, OpenLoopScenario, run_open_loop
 from tlf_env.physics.parameters import RobotParameters
 from tlf_env.task.feasibility import grip_acceleration, motor_acceleration, start_note, warnings_for
-from tlf_env.task.scenario import Scenario, load_scenario
+from tlf_env.task.scenario import Scenario, load_scenario, scenario_warnings
 from tlf_env.task.trajectories import (
     Circle,
     Lissajous,
@@ -526,6 +527,19 @@ class TestWarnings:
         assert "(250" in text
         assert "robot_0 and robot_5 are" in text
         assert "below 220 mm" in text
+
+    @pytest.mark.parametrize("name", preset_names())
+    def test_shipped_rows_do_not_meet(self, name):
+        assert not any("apart, below" in line for line in scenario_warnings(load_scenario(name)))
+
+    @pytest.mark.parametrize(
+        ("name", "most", "behind"), [("infinity", 5, 5), ("flower", 6, 6), ("long_circle", 23, 23)]
+    )
+    def test_one_robot_too_many_meets_another(self, name, most, behind):
+        """Half a period of the ∞, 25.1 s, three quarters of a loop of the flower, a whole long circle."""
+        assert not scenario_warnings(load_scenario(name, robots=most))
+        (line,) = scenario_warnings(load_scenario(name, robots=most + 1))
+        assert f"robot_0 and robot_{behind} are" in line
 
     def test_robots_closer_than_their_outlines(self):
         slow = Circle(radius_mm=1000, speed_mm_s=40)

@@ -98,7 +98,7 @@ def test_the_tuned_reference_runs_on_an_estimate_of_the_slip():
         assert fit_policy(name, SCENARIO).overrides == {}
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "truth", "ekf-slip"])
+@pytest.mark.parametrize("estimator", ["ekf", "truth", "ekf-slip", "ekf-gyro"])
 def test_an_estimator_that_is_set_is_kept(estimator):
     fitted = fit_policy("reference:tuned", load_scenario(horizon_s=0.2, estimator=estimator))
     assert (fitted.overrides, fitted.scenario.estimator) == ({}, estimator)

@@ -12,6 +12,7 @@ from baselines.policies.laws.law import ErrorBounds
 from baselines.policies.laws.textbook import FeedbackLinearisation, Kanayama
 from baselines.policies.registry import fit_policy, make_policy, policy_hash, policy_names
 from baselines.policies.systems import (
+    ESTIMATORS,
     LimitedLaw,
     Limiter,
     load_limiter,
@@ -21,7 +22,6 @@ from baselines.policies.systems import (
 from baselines.runs.run import run_policy
 from tlf_env.common.presets import preset_names, yaml_text
 from tlf_env.onboard.controllers import controller
-from tlf_env.onboard.kinds import ESTIMATOR_KINDS
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
@@ -65,7 +65,7 @@ def drive(name, **fields):
 
 
 @pytest.mark.parametrize("law", policy_names())
-@pytest.mark.parametrize("estimator", ESTIMATOR_KINDS)
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("limiter", [None, *preset_names("limiter"), "my+own.yaml"])
 def test_a_name_is_its_parts(law, estimator, limiter):
     name = "+".join(part for part in (law, estimator, limiter) if part)
@@ -100,7 +100,10 @@ def test_a_path_with_a_plus_is_still_one_controller(tmp_path):
         ("reference:+ekf+none", "controller 'reference:' is not one of"),
         ("+ekf+none", "controller '' is not one of"),
         ("kanayama+ekf-slp+body", "estimator 'ekf-slp' is .*; did you mean 'ekf-slip'?"),
-        ("kanayama+body", "estimator 'body' is not one of ekf, ekf-slip, truth; a system is CONTR"),
+        (
+            "kanayama+body",
+            "estimator 'body' is not one of ekf, ekf-slip, ekf-gyro, truth, ekf-smoothed",
+        ),
         ("kanayama+", "estimator '' is not one of ekf"),
         ("kanayama+ekf+bodi", "limiter 'bodi' is not one of body, .*, FILE.yaml; did you mean"),
         ("kanayama+ekf+", "limiter '' is not one of body, none, yaw-rate, FILE.yaml"),
@@ -273,3 +276,13 @@ def test_a_batch_is_its_rows():
 def test_the_reference_takes_no_gains_by_default():
     default = make_policy("reference+ekf+none", SCENARIO).predict(rows())[0]
     assert default.tobytes() == ReferencePolicy("consistent").predict(rows())[0].tobytes()
+
+
+def test_a_smoothed_estimator_is_the_filter_with_smoothed_broadcasts():
+    scenario = fit_policy("kanayama+ekf-gyro-smoothed+body", SCENARIO).scenario
+    assert (scenario.estimator, scenario.broadcast_smoothing_s) == ("ekf-gyro", 0.1)
+    assert fit_policy("kanayama+ekf-gyro+body", scenario).scenario == scenario  # as before
+    other = load_scenario("infinity", broadcast_smoothing_s=0.2)
+    said = r"^system '.*' names the broadcast_smoothing_s 0\.1; the scenario sets 0\.2$"
+    with pytest.raises(ValueError, match=said):
+        fit_policy("kanayama+ekf-gyro-smoothed+body", other)

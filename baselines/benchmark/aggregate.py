@@ -15,8 +15,16 @@ from typing import Any
 import numpy as np
 
 from baselines.benchmark.comparisons import comparisons
-from baselines.benchmark.lines import Line, Strata, failures, run_score, stratum_of, worst
-from baselines.benchmark.page import markdown
+from baselines.benchmark.lines import (
+    Line,
+    Strata,
+    failures,
+    run_score,
+    step_times,
+    stratum_of,
+    worst,
+)
+from baselines.benchmark.page import PAIRED, markdown
 from baselines.benchmark.results import BOARD_FILE, PAGE_FILE, PLAN_FILE, Results
 from baselines.benchmark.statistics import (
     crossing,
@@ -79,6 +87,7 @@ def leaderboard(results: Results, command: str = "") -> dict[str, Any]:
         "cells": cells,
         "profiles": {policy: profile(strata) for policy, strata in groups.items()},
         "comparisons": comparisons(groups, [row["policy"] for row in policies]),
+        "compared_by": PAIRED,
         "breaking_points": breaking_points(results, cells),
     }
 
@@ -140,6 +149,7 @@ def policy_table(
         "score": {"iqm": own, "interval": stratified_interval(scores, pooled_iqm)},
         "normalised_score": own / base if base else None,
         "probability_of_improvement": float(np.mean(better)) if better else None,
+        **({"step_ms": times} if (times := step_times(lines)) else {}),
     }
 
 

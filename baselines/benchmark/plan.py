@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import SeedRange
 from tlf_env.common.errors import nearest
 from tlf_env.common.presets import beside, is_file_name, preset_names, read_preset_or_file
+from tlf_env.disturbances.model import Disturbance
 from tlf_env.task.scenario import Scenario, load_scenario
+
+SWEEP_DIGITS = 6  # of values that are not given but computed on a logarithmic scale
 
 
 class Episode(NamedTuple):
@@ -40,8 +44,11 @@ class Episode(NamedTuple):
 class Plan:
     """The episodes to be run.
 
-    ``overrides`` are fields of every scenario; ``sweep`` is the path of a knob, a disturbance's parameter.
+    ``overrides`` are fields of every scenario; ``sweep`` is the path of a knob: a parameter of the disturbance,
+    its ``level``, or a field of the scenario.
     """
+
+    unrecorded: ClassVar[tuple[str, ...]] = ("trust",)  # a permission, which changes no result
 
     policies: tuple[str, ...]
     tasks: tuple[str, ...]
@@ -81,21 +88,30 @@ class Plan:
         disturbance: Any = episode.disturbance
         level = episode.level
         if self.sweep is not None and episode.sweep is not None:
+            head = self.sweep.partition(".")[0]
             if self.sweep == "level":
                 level = episode.sweep
             else:
-                base = load_scenario(episode.task, disturbance=disturbance).disturbance
+                base = load_scenario(episode.task, disturbance=disturbance, **overrides)
+                of_disturbance = (
+                    head in Disturbance.model_fields or head not in Scenario.model_fields
+                )
+                tree = (base.disturbance if of_disturbance else base).model_dump()
                 try:
-                    disturbance = with_value(base.model_dump(), self.sweep, episode.sweep)
+                    changed = with_value(tree, self.sweep, episode.sweep)
                 except ValueError as error:
                     raise ValueError(f"sweep: {error}") from error
+                if of_disturbance:
+                    disturbance = changed
+                else:
+                    overrides[head] = changed[head]
         return load_scenario(
             episode.task, disturbance=disturbance, disturbance_level=level, **overrides
         )
 
 
 def parse_sweep(text: str) -> tuple[str, tuple[float, ...]]:
-    """``path=first:last:count`` as the path and the values.
+    """A path and its values: ``path=first:last:count``, geometric with ``:log``, or ``path=value,value,...``.
 
     Raises
     ------
@@ -103,17 +119,32 @@ def parse_sweep(text: str) -> tuple[str, tuple[float, ...]]:
         if the text has another form.
     """
     path, _, span = text.partition("=")
-    parts = span.split(":")
     try:
-        first, last, count = float(parts[0]), float(parts[1]), int(parts[2])
-        if len(parts) != 3 or count < 2 or not path:
+        values = _values(span)
+        if not path or len(values) < 2 or not all(map(math.isfinite, values)):
             raise ValueError
-    except (ValueError, IndexError):
+    except ValueError:
         raise ValueError(
             f"sweep {text!r} must be PATH=FIRST:LAST:COUNT with COUNT at least 2, "
-            "e.g. slip.delta_1_mm_s=0:40:9"
+            "e.g. slip.delta_1_mm_s=0:40:9; PATH=FIRST:LAST:COUNT:log with FIRST and LAST above 0; or "
+            "PATH=VALUE,VALUE,..."
         ) from None
-    return path, tuple(first + (last - first) * i / (count - 1) for i in range(count))
+    return path, values
+
+
+def _values(span: str) -> tuple[float, ...]:
+    if ":" not in span:
+        return tuple(map(float, span.split(",")))
+    ends = span.removesuffix(":log")
+    first, last, count = (
+        kind(part) for kind, part in zip((float, float, int), ends.split(":"), strict=True)
+    )
+    shares = [i / (count - 1) for i in range(count)] if count > 1 else []
+    if ends == span:
+        return tuple(first + (last - first) * share for share in shares)
+    if min(first, last) <= 0:
+        raise ValueError
+    return tuple(float(f"{first * (last / first) ** share:.{SWEEP_DIGITS}g}") for share in shares)
 
 
 def parse_seeds(text: str) -> SeedRange:

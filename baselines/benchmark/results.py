@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import json
 import os
+from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from baselines.benchmark.plan import Episode, Plan
 from baselines.policies.registry import fit_policy, policy_hash
@@ -20,6 +21,8 @@ from baselines.runs.provenance import (
 from tlf_env.common.files import atomic, parse_json
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.task.neutral import scenario_hash
+
+KeyT = TypeVar("KeyT")
 
 RUNS_FILE, PLAN_FILE, BOARD_FILE, PAGE_FILE = (
     "runs.jsonl",
@@ -54,7 +57,8 @@ def plan_record(plan: Plan) -> dict[str, Any]:
         for name in plan.policies:
             policies[name] = policy_hash(name, fit_policy(name, scenario, trust=plan.trust).policy)
     asked = asdict(plan)
-    del asked["trust"]  # a permission, which changes no result
+    for field in plan.unrecorded:
+        del asked[field]
     return {
         "plan": json.loads(json.dumps(asked)),
         "policies": policies,
@@ -64,6 +68,44 @@ def plan_record(plan: Plan) -> dict[str, Any]:
         "versions": versions(),
         "git_revision": git_revision(),
     }
+
+
+def read_lines(path: Path, key: Callable[[dict[str, Any]], KeyT]) -> dict[KeyT, dict[str, Any]]:
+    """The lines of a JSONL file by their keys; none without a file.
+
+    Complete lines only: a half-written last line of a killed process is removed from the file.
+
+    Raises
+    ------
+    ValueError
+        naming the first damaged line.
+    """
+    if not path.exists():
+        return {}
+    data = path.read_bytes()
+    whole = data[: data.rfind(b"\n") + 1]
+    if len(whole) < len(data):
+        with atomic(path, "wb") as file:
+            file.write(whole)
+    lines: dict[KeyT, dict[str, Any]] = {}
+    for number, text in enumerate(whole.splitlines(), start=1):
+        try:
+            line = parse_json(text)
+            lines[key(line)] = line
+        except (ValueError, KeyError, TypeError) as error:
+            raise ValueError(f"{path}, line {number} is damaged; remove it") from error
+    return lines
+
+
+def append_line(path: Path, line: dict[str, Any]) -> None:
+    """Append one line to a JSONL file; it is on the disk when this returns."""
+    text = json.dumps(line, allow_nan=False) + "\n"
+    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
+    try:
+        os.write(handle, text.encode())
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
 class Results:
@@ -84,33 +126,11 @@ class Results:
         self.lines = self._read()
 
     def _read(self) -> dict[Episode, dict[str, Any]]:
-        """Complete lines only: a half-written last line of a killed process is removed."""
-        path = self.folder / RUNS_FILE
-        if not path.exists():
-            return {}
-        data = path.read_bytes()
-        whole = data[: data.rfind(b"\n") + 1]
-        if len(whole) < len(data):
-            with atomic(path, "wb") as file:
-                file.write(whole)
-        lines: dict[Episode, dict[str, Any]] = {}
-        for number, text in enumerate(whole.splitlines(), start=1):
-            try:
-                line = parse_json(text)
-                lines[Episode.of_line(line)] = line
-            except (ValueError, KeyError, TypeError) as error:
-                raise ValueError(f"{path}, line {number} is damaged; remove it") from error
-        return lines
+        return read_lines(self.folder / RUNS_FILE, Episode.of_line)
 
     def add(self, line: dict[str, Any]) -> None:
         """Append one episode; it is on the disk when this returns."""
-        text = json.dumps(line, allow_nan=False) + "\n"
-        handle = os.open(self.folder / RUNS_FILE, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-        try:
-            os.write(handle, text.encode())
-            os.fsync(handle)
-        finally:
-            os.close(handle)
+        append_line(self.folder / RUNS_FILE, line)
         self.lines[Episode.of_line(line)] = line
 
     def missing(self) -> list[Episode]:

@@ -91,7 +91,7 @@ def crossing(values: Sequence[float], shares: Sequence[float], level: float) -> 
 
 
 def paired(values: Sequence[tuple[float | None, float | None]], how: str) -> dict[str, Any]:
-    """Difference or ratio of two medians; its interval resamples pairs.
+    """Median of the pairs' differences or ratios; its interval resamples pairs.
 
     None if no pair is defined, and for a ratio with a divisor of 0 in some pair.
     """
@@ -103,10 +103,8 @@ def paired(values: Sequence[tuple[float | None, float | None]], how: str) -> dic
 
 
 def _median_difference(pairs: np.ndarray) -> float:
-    mine, theirs = np.median(pairs, axis=0)
-    return float(mine - theirs)
+    return float(np.median(pairs[:, 0] - pairs[:, 1]))
 
 
 def _median_ratio(pairs: np.ndarray) -> float:
-    mine, theirs = np.median(pairs, axis=0)
-    return float(mine / theirs)
+    return float(np.median(pairs[:, 0] / pairs[:, 1]))

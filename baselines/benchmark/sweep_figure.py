@@ -29,6 +29,9 @@ from baselines.runs.style import GREY
 ERROR_METRIC, ERROR_LABEL = "position_rmse_mm", "position RMS of the worst robot (mm)"
 BAND = 0.12  # opacity of an interval's band
 UNITS = {
+    "_Nmm": "N·mm",
+    "_N": "N",
+    "_hz": "Hz",
     "_kg_mm2": "kg·mm²",
     "_rad_s": "rad/s",
     "_mm_s": "mm/s",
@@ -65,6 +68,8 @@ def draw_sweep(board: Board) -> Figure:
         tidy_panels(success, error)
     for axes in grid[-1]:
         axes.set_xlabel(knob_label(swept(board) or ""))
+        if is_geometric([cell["sweep"] for cell in board["cells"]]):
+            axes.set_xscale("log")
     marks = [
         Line2D([], [], color=GREY, ls=ls, label=f"{percent} % fail") for percent, ls in LOSS_LINES
     ]
@@ -112,9 +117,24 @@ def _breaking_marks(board: Board, axes: Axes, task: str, disturbance: str) -> No
                 )
 
 
+def is_geometric(values: Sequence[float]) -> bool:
+    """Whether values are evenly spaced on a logarithmic scale rather than on a linear one."""
+    known = np.unique(values)
+    if len(known) < 3 or known[0] <= 0:
+        return False
+    steps, ratios = np.diff(known), np.diff(np.log(known))
+    return bool(np.ptp(ratios) / ratios.mean() < np.ptp(steps) / steps.mean())
+
+
 def knob_label(path: str) -> str:
     """A knob and the unit at the end of its name: ``slip.delta_1_mm_s`` → ``slip.delta_1 (mm/s)``."""
-    for suffix, unit in UNITS.items():
-        if path.endswith(suffix):
-            return f"{path.removesuffix(suffix)} ({unit})"
-    return path
+    unit = unit_of(path)
+    if unit is None:
+        return path
+    suffix = next(suffix for suffix, name in UNITS.items() if name == unit)
+    return f"{path.removesuffix(suffix)} ({unit})"
+
+
+def unit_of(name: str) -> str | None:
+    """The unit at the end of a name: ``delta_1_mm_s`` → ``mm/s``; None without one."""
+    return next((unit for suffix, unit in UNITS.items() if name.endswith(suffix)), None)

@@ -11,11 +11,14 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from baselines.policies.card import WEIGHTS
+from baselines.policies.entries import EntryPolicy, make_entry
 from baselines.policies.laws.catalogue import LAWS, make_law
 from baselines.policies.laws.law import Law
 from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.systems import (
+    ENTRY,
+    ESTIMATORS,
     LimitedLaw,
     make_system,
     parse_system,
@@ -37,6 +40,8 @@ OVERRIDABLE = (
     "residual_reach_mm",
     "estimator",
     "ekf_slip",
+    "ekf_gyro",
+    "broadcast_smoothing_s",
     "preview_s",
     "rays",
 )
@@ -65,9 +70,10 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
         (``.yaml``), a law of :data:`LAWS` such as ``kanayama`` (each also with ``:PARAMETERS``, a preset or
         the path of a ``.yaml`` file), a system ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the
         name of a shipped learned policy, the path of a ``.safetensors`` file (with its card in the same
-        folder), ``module:factory`` of an object with SB3's ``predict``, or the path of an SB3 ``.zip`` file.
+        folder), ``module:factory`` of an object with SB3's ``predict``, ``entry:FOLDER`` of a
+        competition's entry, or the path of an SB3 ``.zip`` file.
     trust
-        Allow an SB3 ``.zip`` file: loading one runs code that it contains.
+        Allow an SB3 ``.zip`` file and an entry's program: both run code that is in them.
 
     Raises
     ------
@@ -117,6 +123,8 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
             policy = _made(name, scenario, trust=trust)  # a law is made for the previews
     if isinstance(policy, LearnedPolicy):
         policy.bind(name, scenario)
+    elif isinstance(policy, EntryPolicy):
+        policy.bind(scenario)
     return FittedPolicy(policy, scenario, asked)
 
 
@@ -151,16 +159,20 @@ def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
             f"policy {name!r}: scenario_overrides must map fields of {', '.join(OVERRIDABLE)}; "
             f"got {asked!r}"
         )
-    differs = parse_system(name) and scenario.estimator != asked["estimator"]
-    if differs and "estimator" in scenario.model_fields_set:
-        raise ValueError(
-            f"system {name!r} names the estimator {asked['estimator']!r}; the scenario sets "
-            f"{scenario.estimator!r}"
-        )
+    system = parse_system(name)
+    if system is not None:
+        for field, value in ESTIMATORS[system.estimator].items():
+            if field in scenario.model_fields_set and getattr(scenario, field) != value:
+                raise ValueError(
+                    f"system {name!r} names the {field} {value!r}; the scenario sets "
+                    f"{getattr(scenario, field)!r}"
+                )
     return {field: asked[field] for field in asked if field not in scenario.model_fields_set}
 
 
 def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
+    if name.startswith(ENTRY):
+        return make_entry(name, scenario, trust=trust)
     if name.lower().endswith(".zip"):
         return _stable_baselines(Path(name), scenario, trust=trust)
     if name.lower().endswith(WEIGHTS) or name in shipped_policies():
@@ -180,7 +192,7 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])
     raise ValueError(
-        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, FILE.zip"
+        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, {ENTRY}FOLDER, FILE.zip"
     )
 
 
@@ -220,7 +232,7 @@ def _hashed_content(path: Path) -> bytes:
 
 def _source_files(policy: Policy) -> list[Path]:
     """A learned policy's weights and card, or the file of the class and the controller file, if any."""
-    if isinstance(policy, LearnedPolicy):
+    if isinstance(policy, LearnedPolicy | EntryPolicy):
         return list(policy.files)
     try:
         source = inspect.getsourcefile(type(policy))

@@ -24,7 +24,7 @@ from tlf_env.common.presets import (
 )
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.controllers import controller, controller_names
-from tlf_env.onboard.kinds import ESTIMATOR_KINDS
+from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.limiter import TwistLimits
 from tlf_env.onboard.parts import Policy
 from tlf_env.onboard.spacing import Spacing
@@ -33,7 +33,23 @@ from tlf_env.task.actions import ACTION_SIZE, twist_action
 from tlf_env.task.scenario import Scenario
 
 FORM = "CONTROLLER+ESTIMATOR or CONTROLLER+ESTIMATOR+LIMITER"
+ENTRY = "entry:"  # before the folder of a competition's entry
 NOT_LIMITED = (".zip", ".safetensors")  # learned policies, whose paths may contain a +
+
+
+BROADCAST_SMOOTHING_S = 0.1
+SMOOTHED: tuple[EstimatorKind, ...] = ("ekf", "ekf-slip", "ekf-gyro")
+# The fields of the scenario that an estimator's name sets: the filter on board, and what is broadcast of it.
+ESTIMATORS: dict[str, dict[str, Any]] = {
+    **{kind: {"estimator": kind} for kind in ESTIMATOR_KINDS},
+    **{
+        f"{kind}-smoothed": {
+            "estimator": kind,
+            "broadcast_smoothing_s": BROADCAST_SMOOTHING_S,
+        }
+        for kind in SMOOTHED
+    },
+}
 
 
 class SystemName(NamedTuple):
@@ -79,15 +95,15 @@ def parse_system(name: str) -> SystemName | None:
     ValueError
         naming the part, if the name has a ``+`` and no estimator behind it, or a part is empty.
     """
-    if "+" not in name or name.lower().endswith(NOT_LIMITED):
+    if "+" not in name or name.lower().endswith(NOT_LIMITED) or name.startswith(ENTRY):
         return None
-    kinds = "|".join(map(re.escape, ESTIMATOR_KINDS))
+    kinds = "|".join(map(re.escape, ESTIMATORS))
     found = re.match(rf"(?P<controller>.*?)\+(?P<estimator>{kinds})(?:\+(?P<limiter>.*))?$", name)
     if found is None:
         head, _, tail = name.partition("+")
         if ":" in head and is_file_name(name) and Path(name.partition(":")[2]).is_file():
             return None  # the path of one controller file
-        raise _unknown(name, "estimator", tail.partition("+")[0], ESTIMATOR_KINDS)
+        raise _unknown(name, "estimator", tail.partition("+")[0], ESTIMATORS)
     system = SystemName(**found.groupdict())
     if not system.controller:
         raise _unknown(name, "controller", "", system_controllers())
@@ -249,7 +265,7 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
         files += [Path(inspect.getfile(type(made))), *made.files]
     policy.files = tuple(files)
     policy.privileged = system.estimator == "truth"
-    policy.scenario_overrides = {**asked, "estimator": system.estimator}
+    policy.scenario_overrides = {**asked, **ESTIMATORS[system.estimator]}
     return policy
 
 

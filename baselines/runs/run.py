@@ -163,12 +163,22 @@ def run_policy(
 
 
 def run_seeds(
-    scenario: Scenario, policy: Policy, seeds: Sequence[int], *, name: str = "policy"
+    scenario: Scenario,
+    policy: Policy,
+    seeds: Sequence[int],
+    *,
+    name: str = "policy",
+    most_failed: int | None = None,
 ) -> Iterator[Record]:
     """Runs of several seeds side by side, without contact between robots; as :func:`run_policy`.
 
     The policy is called once per step with all rows, ``(seed · robots, entry)``. If it refuses them with
     a ValueError, the seeds are run one after the other.
+
+    Parameters
+    ----------
+    most_failed
+        Stop, with no record at all, as soon as robots are lost or touch in more runs than this.
     """
     with without_warnings():
         plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds))
@@ -187,6 +197,8 @@ def run_seeds(
     for k in range(1, steps + 1):
         plant.step(actions)
         tape.note(k, scenario.control_period_s)
+        if most_failed is not None and tape.failed > most_failed:
+            return
         if k < steps:
             actions = driver.act()
     for lane, seed in enumerate(seeds):
@@ -246,6 +258,12 @@ class _Tape:
             self._lost_at_s[a.lost_now] = step * period_s
             self._touched_at_s[a.touched_now] = step * period_s
             self._touched_by[a.touched_now] = a.touched_by[a.touched_now]
+
+    @property
+    def failed(self) -> int:
+        """Number of lanes in which a robot has been lost or has touched something."""
+        ended = np.isfinite(self._lost_at_s) | np.isfinite(self._touched_at_s)
+        return int(ended.any(axis=1).sum())
 
     def record(self, lane: int, scenario: Scenario, seed: int, policy: str) -> Record:
         """The record of a lane."""

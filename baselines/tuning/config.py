@@ -19,6 +19,7 @@ from baselines.policies.reference import ReferencePolicy
 from baselines.policies.systems import Limiter
 from baselines.runs.nested import value_at, with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
+from baselines.runs.splits import check_training
 from baselines.tuning.start import LawStart, named_start
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch, Whole
@@ -275,7 +276,8 @@ class TuneConfig(Frozen):
         Raises
         ------
         ValueError
-            for an unknown task or disturbance, or a scenario that the batch plant or the law cannot run.
+            for an unknown task or disturbance, one that must not tune
+            (:mod:`baselines.runs.splits`), or a scenario that the batch plant or the law cannot run.
         """
         made = {}
         asked = self.start.scenario_overrides if isinstance(self.start, LawStart) else {}
@@ -294,6 +296,7 @@ class TuneConfig(Frozen):
                     raise ValueError(
                         f"task {task!r} must have action 'twist', observation 'tracking'"
                     )
+                check_training(scenario)
                 made[f"{task}, {disturbance}"] = scenario
         return made
 

@@ -25,6 +25,7 @@ KINDS = {
     "training": "train",
     "search": "tune",
     "limiter": "limiters",
+    "knob": "knobs",
     "pure_pursuit": "laws/pure_pursuit",
     "feedback_linearisation": "laws/feedback_linearisation",
     "kanayama": "laws/kanayama",
