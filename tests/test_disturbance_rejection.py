@@ -2,14 +2,17 @@
 
 import math
 
+import gymnasium
 import numpy as np
 import pytest
 
 from baselines.policies.laws.disturbance_rejection import DisturbanceRejection
 from baselines.policies.laws.law import ErrorBounds
 from baselines.policies.laws.textbook import FeedbackLinearisation
+from baselines.policies.registry import fit_policy
+from baselines.runs.run import run_policy, run_seeds
 from tlf_env.task.observation import tracking_entries
-from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S, DEFAULT_PREVIEW_S
+from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S, DEFAULT_PREVIEW_S, load_scenario
 
 ENTRIES = tracking_entries(DEFAULT_PREVIEW_S)
 T = DEFAULT_CONTROL_PERIOD_S
@@ -99,3 +102,28 @@ def test_the_observer_sees_the_errors_without_bounds():
     _, memories = driven(DisturbanceRejection(bounds=bounds), start=(200.0, -300.0, 0.5), steps=150)
     assert np.abs(memories[:, D_1]).max() < 0.3
     assert np.abs(memories[:, D_2]).max() < 0.01
+
+
+def test_side_by_side_and_alone_the_memories_are_apart():
+    scenario = load_scenario("infinity", horizon_s=2.0, disturbance="slip", plant="batch")
+    fitted = fit_policy("adrc:bounded+ekf-slip+body", scenario)
+    together = list(run_seeds(fitted.scenario, fitted.policy, [3, 4]))
+    for seed, record in zip((3, 4), together, strict=True):
+        alone = run_policy(fitted.scenario, fitted.policy, seed)
+        np.testing.assert_array_equal(record["x_mm"], alone["x_mm"])
+    assert (together[0]["x_mm"] != together[1]["x_mm"]).any()
+
+
+def test_a_reset_of_the_environment_clears_the_memory_of_the_others():
+    fitted = fit_policy("adrc:bounded+ekf-slip+body", load_scenario("infinity"))
+    env = gymnasium.make(
+        "tlf_env/Infinity-v0", others=fitted.policy, disturbance="slip", estimator="ekf-slip"
+    )
+
+    def rewards(seed):
+        env.reset(seed=seed)
+        return [env.step(np.zeros(2, dtype=np.float32))[1] for _ in range(60)]
+
+    first = rewards(3)
+    rewards(4)
+    assert rewards(3) == first

@@ -95,7 +95,7 @@ class Predictive(Remembering):
     def __init__(
         self,
         preview_s: tuple[float, ...] = PREVIEW_S,
-        position_mm: float = 10.0,
+        position_mm: float = 20.0,
         heading_rad: float = 0.3,
         speed_mm_s: float = 100.0,
         turning_rad_s: float = 1.0,
