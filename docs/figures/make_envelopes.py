@@ -17,7 +17,7 @@ from make_board import DOCS
 from make_parts import put
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.ticker import NullLocator
+from matplotlib.ticker import MaxNLocator, NullLocator
 
 from baselines.benchmark.bench import run_bench
 from baselines.benchmark.envelope import EnvelopePlan, knob_presets
@@ -226,6 +226,9 @@ def rows_figure(curves: Curves) -> None:
         right.set_ylabel("position RMS (mm)")
         for axes in (left, right):
             axes.set_yscale("log")
+    counts = sorted({line["sweep"] for line in lines})
+    grid[-1][0].set_xticks(counts, [f"{count:g}" for count in counts])
+    grid[-1][1].xaxis.set_major_locator(MaxNLocator(integer=True))
     grid[-1][0].set_xlabel("robots in the row")
     grid[-1][1].set_xlabel("place in the row, from the leader")
     save(figure, "rows", list(grid.flat))
