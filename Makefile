@@ -50,7 +50,7 @@ check-lowest: ## Run the tests with the lowest versions that pyproject.toml allo
 	"$$uv" venv -q --python "$(PYTHON)" "$$VIRTUAL_ENV"; \
 	"$$uv" pip install -q "torch==$(TORCH)"; \
 	"$$uv" pip install -q --resolution lowest-direct \
-		-e ".[figures,view,train,tune,bench,peers,ray,benchmarl,dev]"; \
+		-e ".[figures,view,train,tune,mpc,bench,peers,ray,benchmarl,dev]"; \
 	"$$uv" pip check; \
 	"$$VIRTUAL_ENV/bin/python" -m pytest $(TESTS)
 
@@ -90,7 +90,7 @@ constraints: ## Update constraints.txt from a temporary environment with every e
 	$(PYTHON) -m venv "$$tmp/venv"; \
 	py="$$tmp/venv/bin/python"; \
 	"$$py" -m pip install -q --disable-pip-version-check "torch==$(TORCH)" \
-		build editables hatchling ".[figures,view,train,tune,bench,peers,ray,benchmarl,dev]"; \
+		build editables hatchling ".[figures,view,train,tune,mpc,bench,peers,ray,benchmarl,dev]"; \
 	"$$py" -m pip check; \
 	echo "# Versions of everything that the extras install. Made by: make constraints" > "$$tmp/new"; \
 	"$$py" -m pip freeze --all --exclude pip --exclude tlf-env > "$$tmp/frozen"; \
@@ -112,7 +112,7 @@ $(VENV)/.stamp-run: $(VENV)/.stamp-venv pyproject.toml constraints.txt
 
 # mpe2 instead of the extra `peers`, because that also installs vmas and with it torch.
 $(VENV)/.stamp-test: $(VENV)/.stamp-run
-	$(PIP) -c constraints.txt -e ".[figures,view,bench,tune,dev]" mpe2
+	$(PIP) -c constraints.txt -e ".[figures,view,bench,tune,mpc,dev]" mpe2
 	@touch $@
 
 $(VENV)/.stamp-train: $(VENV)/.stamp-test

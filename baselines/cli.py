@@ -16,6 +16,7 @@ import typer
 from typer.exceptions import TyperException
 
 from baselines.console import (
+    given,
     listed,
     notes,
     print_on_any_terminal,
@@ -59,9 +60,9 @@ def run(
         str,
         typer.Option(
             help="reference[:GAINS], reference:FILE.yaml, pure_pursuit, feedback_linearisation, kanayama, "
-            "CONTROLLER+ESTIMATOR+LIMITER of these (e.g. kanayama+ekf-slip+body), the name of a shipped "
-            "policy, FILE.safetensors (with FILE.json), module:factory, FILE.zip "
-            "(with --trust)."
+            "lqr, sliding_mode, adrc, nmpc, CONTROLLER+ESTIMATOR+LIMITER of these (e.g. "
+            "kanayama+ekf-slip+body), the name of a shipped policy, FILE.safetensors (with FILE.json), "
+            "module:factory, FILE.zip (with --trust)."
         ),
     ] = "reference",
     gains: Annotated[
@@ -73,7 +74,7 @@ def run(
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="ekf (the paper's), ekf-slip, truth (the true pose and slip), or module:factory."
+            help="ekf (the paper's), ekf-slip, ekf-gyro, truth (the true pose and slip), or module:factory."
         ),
     ] = None,
     wheel_loop: Annotated[str | None, typer.Option(help="Own wheel loop, module:factory.")] = None,
@@ -345,7 +346,9 @@ def bench(
     ] = None,
     trust: Annotated[
         bool,
-        typer.Option("--trust", help="Load SB3 .zip files; loading runs code that they contain."),
+        typer.Option(
+            "--trust", help="Load SB3 .zip files and run entries' programs: code that they contain."
+        ),
     ] = False,
     plan: Annotated[
         str | None,
@@ -357,18 +360,57 @@ def bench(
             callback=take_plan,
         ),
     ] = None,
-    out: Annotated[Path, typer.Option(help="Folder of the results.")] = Path("results/bench"),
+    entry: Annotated[
+        list[Path] | None,
+        typer.Option(
+            help="Folder of a competition's entry, with entry.yaml; may be repeated. Without --policies only "
+            "the entries run.",
+        ),
+    ] = None,
+    test: Annotated[
+        bool,
+        typer.Option(
+            "--test",
+            help="Run the test set: cases with random tasks, robots and disturbances, 20000:20200 unless "
+            "--seeds has others. Every look is logged.",
+        ),
+    ] = False,
+    test_seed: Annotated[
+        str | None,
+        typer.Option(help="Run cases made from this text in place of the published test set."),
+    ] = None,
+    out: Annotated[
+        Path | None,
+        typer.Option(help="Folder of the results; default results/bench or results/test."),
+    ] = None,
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print leaderboard.json instead of the tables.")
     ] = False,
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
+    names = listed(policies)
+    if entry:
+        names = (*(names if given(ctx, "policies") else ()), *(f"entry:{one}" for one in entry))
     if envelope:
         from baselines.envelope_command import bench_envelope
 
-        bench_envelope(ctx)
+        bench_envelope(ctx, names)
         return
+    if test or test_seed is not None:
+        refuse_beside_test(ctx)
+        bench_test(
+            names,
+            seeds if given(ctx, "seeds") else None,
+            test_seed,
+            trust=trust,
+            out=out or Path("results/test"),
+            processes=processes or os.cpu_count() or 1,
+            ray=ray,
+            as_json=as_json,
+        )
+        return
+    out = out or Path("results/bench")
     from baselines.benchmark.bench import named_scenarios, run_bench
     from baselines.benchmark.plan import Plan, disturbance_presets, parse_seeds, parse_sweep
     from baselines.runs.provenance import command_line
@@ -376,7 +418,7 @@ def bench(
 
     path, values = parse_sweep(sweep) if sweep else (None, ())
     asked = Plan(
-        policies=listed(policies),
+        policies=names,
         tasks=listed(tasks),
         disturbances=tuple(disturbance_presets())
         if disturbances == "all"
@@ -410,6 +452,62 @@ def bench(
     else:
         screen.print(board_table(board))
         screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
+
+
+def refuse_beside_test(ctx: typer.Context) -> None:
+    """Refuse options that the cases of the test set have themselves.
+
+    Raises
+    ------
+    ValueError
+        naming the first option.
+    """
+    for option in ("tasks", "disturbances", "level", "sweep", "horizon_s", "plant"):
+        if given(ctx, option):
+            raise ValueError(
+                f"--{option.replace('_', '-')} cannot be used with --test: every case has its own"
+            )
+
+
+def bench_test(
+    policies: tuple[str, ...],
+    seeds: str | None,
+    test_seed: str | None,
+    *,
+    trust: bool,
+    out: Path,
+    processes: int,
+    ray: str | None,
+    as_json: bool,
+) -> None:
+    """Run entries on the test set, and write and print the tables."""
+    from baselines.benchmark.bench import run_bench
+    from baselines.benchmark.plan import parse_seeds
+    from baselines.benchmark.testset_page import write_test_board
+    from baselines.benchmark.testset_plan import PUBLISHED, log_look, plan_of_test
+    from baselines.runs.provenance import command_line
+    from baselines.tables import testset_table
+
+    if test_seed == "":
+        raise ValueError("--test-seed must not be empty")
+    cases = PUBLISHED if seeds is None else parse_seeds(seeds)
+    plan = plan_of_test(policies, cases, test_seed or "", trust=trust)
+    warn_of_compiling()
+    with progress_bar("test set") as update:
+        results = run_bench(
+            plan,
+            out,
+            processes=processes,
+            ray_address=ray,
+            progress=update,
+            begin=lambda: log_look(plan, out),
+        )
+    board = write_test_board(results, out, command_line(sys.argv[1:]))
+    if as_json:
+        typer.echo(json.dumps(board, indent=1, allow_nan=False))
+        return
+    screen.print(testset_table(board))
+    screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
 
 
 @app.command()
@@ -480,7 +578,9 @@ def train(
 
 @app.command()
 def tune(
-    config: Annotated[str, typer.Argument(help="Search: a preset (tuned) or a YAML file.")],
+    config: Annotated[
+        str, typer.Argument(help="Search: a preset (tuned, or a law) or a YAML file.")
+    ],
     trials: Annotated[
         int | None, typer.Option(help="Number of trials, including those of earlier calls.")
     ] = None,
@@ -500,11 +600,11 @@ def tune(
         bool, typer.Option("--json", help="Print the result as JSON instead of the table.")
     ] = False,
 ) -> None:
-    """Search a controller's gains, limits and filter. Interrupt it, and call it again to continue."""
+    """Search a controller's or a law's numbers. Interrupt it, and call it again to continue."""
     from baselines.runs.provenance import command_line
     from baselines.tables import tune_table
     from baselines.tuning.config import load_tune
-    from baselines.tuning.search import RESULT_FILE, run_tune
+    from baselines.tuning.search import RESULT_FILE, run_tune, use_of
 
     search = load_tune(config, trials=trials)
     folder = out or Path("results") / "tune" / Path(config).stem
@@ -524,7 +624,9 @@ def tune(
         return
     screen.print(tune_table(result["found"]))
     screen.print(f"In {folder}: {RESULT_FILE}; run it with", soft_wrap=True)
-    screen.print(f"tlf run {search.tasks[0]} --gains {folder / RESULT_FILE}", soft_wrap=True)
+    use = use_of(search, folder)
+    how = use.replace("reference:", "--gains ", 1) if "+" not in use else f"--policy {use}"
+    screen.print(f"tlf run {search.tasks[0]} {how}", soft_wrap=True)
 
 
 def draw_bench(board: dict[str, Any], folder: Path) -> list[Path]:

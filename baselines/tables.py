@@ -86,6 +86,29 @@ def board_table(board: dict[str, Any]) -> Table:
     return table
 
 
+def testset_table(board: dict[str, Any]) -> Table:
+    """Entries on the test set."""
+    table = Table(
+        title=f"test set {board['version']}, {board['fingerprint']}: geometric mean of the formation RMS, "
+        "less is better",
+        box=SIMPLE_HEAD,
+    )
+    table.add_column("entry")
+    for heading in ("score\nmm", "95 %", "held", "95 %"):
+        table.add_column(heading, justify="right")
+    for row in board["entries"]:
+        ends, held = row["score"]["interval"], row["held"]
+        low, high = held["interval"]
+        table.add_row(
+            policy_label(row),
+            f"{row['score']['mm']:.2f}",
+            "–" if ends is None else f"{ends[0]:.2f}–{ends[1]:.2f}",
+            f"{held['count']} of {row['cases']}",
+            f"{100 * low:.0f}–{100 * high:.0f} %",
+        )
+    return table
+
+
 def training_table(curves: list[dict[str, Any]]) -> Table:
     """Scores on the choosing seeds, a row per training seed."""
     table = Table(

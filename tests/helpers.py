@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import hashlib
+import importlib.util
 import marshal
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+import pytest
 from hypothesis import settings
 
 import tlf_env
@@ -142,3 +144,10 @@ def whole_episode_digest(scenario: str, seed: int, **overrides: Any) -> str:
         observations = step[0]
         digests.append(digest(step))
     return digest(digests)
+
+
+def installed(policies):
+    """Names of policies for a parametrised test, which skips those whose package is missing."""
+    missing = importlib.util.find_spec("casadi") is None
+    skip = pytest.mark.skipif(missing, reason="casadi is not installed")
+    return [pytest.param(name, marks=skip if name.startswith("nmpc") else ()) for name in policies]

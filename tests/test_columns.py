@@ -8,8 +8,8 @@ import pytest
 
 from baselines import ReferencePolicy, load_policy
 from baselines.policies.card import write_policy
-from baselines.policies.classical import FeedbackLinearisation, PurePursuit
 from baselines.policies.columns import find_columns, find_scaled_columns
+from baselines.policies.laws.textbook import FeedbackLinearisation, PurePursuit
 from baselines.policies.learned import shipped_policies
 from baselines.policies.network import Network
 from baselines.policies.registry import fit_policy, make_policy

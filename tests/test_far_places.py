@@ -25,7 +25,7 @@ def run_at(place_mm: tuple[float, float], trajectory: dict, **fields) -> Record:
 
 @pytest.mark.parametrize("place_mm", PLACES_MM)
 @pytest.mark.parametrize("plant", ["pymunk", "batch", "kinematic"])
-@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip", "truth"])
+@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip", "ekf-gyro", "truth"])
 def test_errors_do_not_depend_on_the_place(place_mm, plant, estimator):
     here = run_at((0.0, 0.0), CIRCLE, plant=plant, estimator=estimator)
     there = run_at(place_mm, CIRCLE, plant=plant, estimator=estimator)

@@ -5,6 +5,7 @@ import sys
 
 import numpy as np
 import pytest
+from helpers import installed
 from stack_policy import StackPolicy
 
 from baselines.cli import main
@@ -74,7 +75,7 @@ def own_module(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(tmp_path)
 
 
-@pytest.mark.parametrize("name", [*policy_names(), "reference"])
+@pytest.mark.parametrize("name", installed([*policy_names(), "reference"]))
 def test_every_name_makes_a_policy_that_drives(name):
     record = run_policy(SCENARIO, make_policy(name, SCENARIO))
     assert np.isfinite(record["x_mm"]).all()
@@ -97,7 +98,7 @@ def test_the_tuned_reference_runs_on_an_estimate_of_the_slip():
         assert fit_policy(name, SCENARIO).overrides == {}
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "truth", "ekf-slip"])
+@pytest.mark.parametrize("estimator", ["ekf", "truth", "ekf-slip", "ekf-gyro"])
 def test_an_estimator_that_is_set_is_kept(estimator):
     fitted = fit_policy("reference:tuned", load_scenario(horizon_s=0.2, estimator=estimator))
     assert (fitted.overrides, fitted.scenario.estimator) == ({}, estimator)
@@ -225,7 +226,7 @@ def test_a_stack_of_unlike_robots_needs_a_row_for_each():
     StackPolicy(scenario).predict(np.zeros((4, len(sensor_entries(1)))))
 
 
-@pytest.mark.parametrize("name", policy_names())
+@pytest.mark.parametrize("name", installed(policy_names()))
 @pytest.mark.parametrize("fields", [{"observation": "sensor"}, {"action": "wheel_speed"}])
 def test_a_policy_that_does_not_fit_is_reported(name, fields):
     with pytest.raises(ValueError, match="takes 'tracking' observations and gives 'twist'"):

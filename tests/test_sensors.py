@@ -80,7 +80,7 @@ def test_a_fix_that_comes_late_is_the_one_of_its_own_time():
     assert (found[delay:] == true[:-delay]).all()
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip"])
+@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip", "ekf-gyro"])
 def test_late_fixes_without_noise_cost_a_moving_robot_nothing(estimator):
     """Fixes of 50 ms ago at 300 mm/s are 15 mm behind; filters move them on."""
     for every, delay in ((1, 50), (10, 45)):
@@ -93,7 +93,7 @@ def test_late_fixes_without_noise_cost_a_moving_robot_nothing(estimator):
         assert error < 0.3
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip"])
+@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip", "ekf-gyro"])
 def test_without_fixes_the_filter_is_odometry(estimator):
     samples, _, formation = sampled(
         2.0, (0.3, 0.1), estimator=estimator, disturbance={"position": {"outage": 1.0}}

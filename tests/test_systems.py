@@ -4,12 +4,15 @@ import math
 
 import numpy as np
 import pytest
+from helpers import installed
 
 from baselines import ReferencePolicy
 from baselines.benchmark.page import policy_label
-from baselines.policies.classical import ErrorBounds, FeedbackLinearisation, Kanayama
+from baselines.policies.laws.law import ErrorBounds
+from baselines.policies.laws.textbook import FeedbackLinearisation, Kanayama
 from baselines.policies.registry import fit_policy, make_policy, policy_hash, policy_names
 from baselines.policies.systems import (
+    ESTIMATORS,
     LimitedLaw,
     Limiter,
     load_limiter,
@@ -19,7 +22,6 @@ from baselines.policies.systems import (
 from baselines.runs.run import run_policy
 from tlf_env.common.presets import preset_names, yaml_text
 from tlf_env.onboard.controllers import controller
-from tlf_env.onboard.kinds import ESTIMATOR_KINDS
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
@@ -63,7 +65,7 @@ def drive(name, **fields):
 
 
 @pytest.mark.parametrize("law", policy_names())
-@pytest.mark.parametrize("estimator", ESTIMATOR_KINDS)
+@pytest.mark.parametrize("estimator", ESTIMATORS)
 @pytest.mark.parametrize("limiter", [None, *preset_names("limiter"), "my+own.yaml"])
 def test_a_name_is_its_parts(law, estimator, limiter):
     name = "+".join(part for part in (law, estimator, limiter) if part)
@@ -98,7 +100,10 @@ def test_a_path_with_a_plus_is_still_one_controller(tmp_path):
         ("reference:+ekf+none", "controller 'reference:' is not one of"),
         ("+ekf+none", "controller '' is not one of"),
         ("kanayama+ekf-slp+body", "estimator 'ekf-slp' is .*; did you mean 'ekf-slip'?"),
-        ("kanayama+body", "estimator 'body' is not one of ekf, ekf-slip, truth; a system is CONTR"),
+        (
+            "kanayama+body",
+            "estimator 'body' is not one of ekf, ekf-slip, ekf-gyro, truth, ekf-smoothed",
+        ),
         ("kanayama+", "estimator '' is not one of ekf"),
         ("kanayama+ekf+bodi", "limiter 'bodi' is not one of body, .*, FILE.yaml; did you mean"),
         ("kanayama+ekf+", "limiter '' is not one of body, none, yaw-rate, FILE.yaml"),
@@ -133,7 +138,9 @@ def test_a_lead_needs_a_preview():
 
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-@pytest.mark.parametrize("name", [one for one in policy_names() if one != "reference:tuned"])
+@pytest.mark.parametrize(
+    "name", installed(one for one in policy_names() if one != "reference:tuned")
+)
 def test_without_a_limiter_the_laws_twist_is_commanded(name, dtype):
     alone = make_policy(name, SCENARIO).predict(rows(dtype))[0]
     system = make_policy(f"{name}+ekf+none", SCENARIO).predict(rows(dtype))[0]
@@ -215,7 +222,7 @@ def test_the_slip_of_the_observation_is_subtracted(tmp_path):
 def test_a_preset_bounds_the_errors_that_its_law_sees(law):
     forward = 119.0 * math.tanh(math.sqrt(23.0 * (2000.0 - 23.0)) / 119.0)
     preset = make_policy(f"{law}:bounded", SCENARIO)
-    far, near = (preset.wanted(row(reference_u_1=100.0, e_1=e_1)) for e_1 in (1000.0, 10.0))
+    far, near = (preset.wanted(row(reference_u_1=100.0, e_1=e_1))[0] for e_1 in (1000.0, 10.0))
     assert far[0, 0] == pytest.approx(100.0 + 1.3 * forward)
     assert near[0, 0] == pytest.approx(100.0 + 1.3 * 119.0 * math.tanh(10.0 / 119.0))
 
@@ -269,3 +276,13 @@ def test_a_batch_is_its_rows():
 def test_the_reference_takes_no_gains_by_default():
     default = make_policy("reference+ekf+none", SCENARIO).predict(rows())[0]
     assert default.tobytes() == ReferencePolicy("consistent").predict(rows())[0].tobytes()
+
+
+def test_a_smoothed_estimator_is_the_filter_with_smoothed_broadcasts():
+    scenario = fit_policy("kanayama+ekf-gyro-smoothed+body", SCENARIO).scenario
+    assert (scenario.estimator, scenario.broadcast_smoothing_s) == ("ekf-gyro", 0.1)
+    assert fit_policy("kanayama+ekf-gyro+body", scenario).scenario == scenario  # as before
+    other = load_scenario("infinity", broadcast_smoothing_s=0.2)
+    said = r"^system '.*' names the broadcast_smoothing_s 0\.1; the scenario sets 0\.2$"
+    with pytest.raises(ValueError, match=said):
+        fit_policy("kanayama+ekf-gyro-smoothed+body", other)

@@ -211,7 +211,7 @@ def in_tiles(a: Arrays, lanes: np.ndarray, s: Settings) -> None:
     advance(a, lanes, 0, s.substeps, True, True, s)
 
 
-@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip"])
+@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip", "ekf-gyro"])
 @pytest.mark.parametrize("disturbance", ["none", "combined-hard", CHANGING], ids=str)
 def test_a_tile_gives_the_bits_of_the_laws_run_one_by_one(disturbance, estimator):
     lanes = WIDTH + 3

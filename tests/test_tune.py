@@ -14,6 +14,7 @@ import yaml
 pytest.importorskip("optuna")
 
 from baselines.cli import main
+from baselines.policies.laws.catalogue import LAWS
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.registry import fit_policy
 from baselines.runs.run import run_seeds
@@ -391,7 +392,7 @@ def test_bad_input_is_one_line_and_writes_nothing(change, said, tmp_path, monkey
 @pytest.mark.parametrize(
     ("words", "said"),
     [
-        ("no_such", "'no_such' is not one of tuned, nor a .yaml file"),
+        ("no_such", "'no_such' is not one of adrc, "),
         ("no_such.yaml", "cannot read no_such.yaml"),
         ("list.yaml", "must contain a mapping"),
         ("search.yaml --trials 0", "trials: Input should be greater than or equal to 1, got 0"),
@@ -481,3 +482,92 @@ def test_without_optuna_the_command_reports_what_to_install(tmp_path, monkeypatc
     with pytest.raises(ValueError, match=r"pip install 'tlf-env\[tune\]'"):
         run_tune(config(), tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+LAW = {
+    **SMALL,
+    "start": "feedback_linearisation:bounded+ekf-slip+body",
+    "search": {
+        "law.gain_per_s": {"low": 0.5, "high": 3, "log": True},
+        "limits.yaw_rate_rad_s": {"low": 0.5, "high": 3},
+    },
+}
+ONLY_LAW = {"law.ahead_mm": {"low": 40, "high": 200}}
+
+
+def test_a_law_is_searched_and_its_files_drive_the_same_runs(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "search.yaml").write_text(yaml.safe_dump({**LAW, "trials": 3}))
+    monkeypatch.setattr(sys, "argv", ["tlf", "tune", "search.yaml", "--out", "out"])
+    main()
+    name = "feedback_linearisation:out/tuned.yaml+ekf-slip+out/limiter.yaml"
+    assert f"tlf run infinity --policy {name}" in " ".join(capsys.readouterr().out.split())
+    settings = load_tune("search.yaml", trials=3)
+    study = StoredStudy(settings, tmp_path / "out")
+    found = yaml.safe_load((tmp_path / "out" / RESULT_FILE).read_text())["found"]
+    best = settings.built(study.values(found["trial"]))
+    fitted = fit_policy(name, load_scenario("infinity", horizon_s=2.0, plant="batch"))
+    assert fitted.policy.limiter == best.limits_of_it
+    assert fitted.policy.law.gain_per_s == best.parameters["gain_per_s"]
+    (again,) = run_seeds(fitted.scenario, fitted.policy, [0])
+    job = TrialJob(0, study.values(found["trial"]), [0], {})
+    alone = run_trial(TuneConfig.model_validate({**LAW, "disturbances": ["nominal"]}), job)
+    assert measured(again)[0] == {name: alone.strata["infinity, nominal"][name] for name in CAPS}
+
+
+def test_a_law_starts_as_it_is_and_a_limiter_that_is_not_searched_keeps_its_name(tmp_path):
+    settings = TuneConfig.model_validate({**LAW, "search": ONLY_LAW})
+    assert settings.start_values == {"law.ahead_mm": 80.0}
+    scenario = load_scenario("infinity", horizon_s=2.0, plant="batch", estimator="ekf-slip")
+    started = settings.policy(settings.built(settings.start_values), scenario)
+    named = fit_policy(LAW["start"], scenario).policy
+    found, wanted = (next(iter(run_seeds(scenario, one, [0])))["x_mm"] for one in (started, named))
+    assert found.tobytes() == wanted.tobytes()
+    use = search.use_of(settings, tmp_path)
+    assert use == f"feedback_linearisation:{tmp_path / RESULT_FILE}+ekf-slip+body"
+
+
+def test_a_system_of_the_papers_law_is_a_controller():
+    assert config(start="reference:tuned+ekf-slip+body") == config(start="tuned")
+    alone = TuneConfig.model_validate(
+        {**LAW, "start": "kanayama", "search": {"law.k_x_per_s": {"low": 1, "high": 20}}}
+    )
+    assert (alone.estimator, alone.start.limiter, alone.start.lead_s) == ("ekf-slip", None, 0.0)
+    assert alone.start.parameters["k_theta_per_mm"] == pytest.approx(0.016)
+
+
+@pytest.mark.parametrize("name", LAWS)
+def test_every_law_has_a_search_with_the_tasks_and_the_budget_of_all(name):
+    if name == "nmpc":
+        pytest.importorskip("casadi")
+    settings, shared = load_tune(name), load_tune("tuned")
+    assert settings.start.law == name
+    own = {"start", "search"}
+    assert settings.model_dump(exclude=own) == shared.model_dump(exclude=own)
+    assert all(path.startswith("law.") for path in settings.search)
+
+
+@pytest.mark.parametrize(
+    ("change", "said"),
+    [
+        ({"start": "feedback+ekf-slip+body"}, "controller 'feedback'"),
+        ({"start": "kanayama:no_such"}, "kanayama 'no_such' is not one of bounded"),
+        ({"start": "kanayama+ekf-slip+bodi"}, "limiter 'bodi' is not one of body"),
+        ({"estimator": "ekf"}, "names the estimator 'ekf-slip'; estimator is 'ekf'"),
+        ({"search": {"law.gain": {"low": 1, "high": 2}}}, "'law.gain' is not one of law.braking"),
+        ({"search": {"gains.k_1_per_s": {"low": 1, "high": 2}}}, "'gains.k_1_per_s' is not one of"),
+        ({"search": {"law.found": {"low": 1, "high": 2}}}, "'law.found' is not one of"),
+        ({"search": {"law.ahead_mm": {"low": -1, "high": 100}}}, "search.law.ahead_mm, low: "),
+        ({"ekf_slip": {"fix_variance_mm2": 2.0}}, "a law is searched with the scenario's filter"),
+        ({"start": {"law": "kanayam", "parameters": {}}}, "start.law 'kanayam' is not one of"),
+        ({"start": {"law": "lqr", "parameters": {"k": 1}}}, "start.k: unknown key"),
+        ({"like": "no_such"}, "search 'no_such' is not one of adrc"),
+        ({"like": "search.yaml"}, "like: search.yaml → search.yaml goes round in a circle"),
+        ({"like": 3}, "like must be the name of a search or a .yaml file, got 3"),
+    ],
+)
+def test_bad_input_of_a_law_is_one_line_and_writes_nothing(
+    change, said, tmp_path, monkeypatch, capsys
+):
+    (tmp_path / "search.yaml").write_text(yaml.safe_dump({**LAW, **change}))
+    assert said in refused(["search.yaml"], tmp_path, monkeypatch, capsys)

@@ -15,7 +15,15 @@ from typing import Any
 import numpy as np
 
 from baselines.benchmark.comparisons import comparisons
-from baselines.benchmark.lines import Line, Strata, failures, run_score, stratum_of, worst
+from baselines.benchmark.lines import (
+    Line,
+    Strata,
+    failures,
+    run_score,
+    step_times,
+    stratum_of,
+    worst,
+)
 from baselines.benchmark.page import PAIRED, markdown
 from baselines.benchmark.results import BOARD_FILE, PAGE_FILE, PLAN_FILE, Results
 from baselines.benchmark.statistics import (
@@ -141,6 +149,7 @@ def policy_table(
         "score": {"iqm": own, "interval": stratified_interval(scores, pooled_iqm)},
         "normalised_score": own / base if base else None,
         "probability_of_improvement": float(np.mean(better)) if better else None,
+        **({"step_ms": times} if (times := step_times(lines)) else {}),
     }
 
 

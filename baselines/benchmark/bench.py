@@ -15,6 +15,7 @@ from typing import Any
 
 from baselines.benchmark.plan import Episode, Plan
 from baselines.benchmark.results import Results
+from baselines.policies.entries import step_statistics
 from baselines.policies.registry import FittedPolicy, fit_policy
 from baselines.runs.jobs import spread
 from baselines.runs.provenance import physics_digest
@@ -50,6 +51,7 @@ def run_block(plan: Plan, episodes: Sequence[Episode]) -> list[dict[str, Any]]:
 
 def _line(episode: Episode, fitted: FittedPolicy, record: Record) -> dict[str, Any]:
     scenario = record.scenario
+    times = getattr(fitted.policy, "step_times_s", None)  # of an entry that is a process of its own
     return {
         **episode._asdict(),
         "scenario_hash": scenario_hash(scenario),
@@ -59,6 +61,7 @@ def _line(episode: Episode, fitted: FittedPolicy, record: Record) -> dict[str, A
         "contact": record.contact,
         "string": record.string()._asdict(),
         "robots": [metrics._asdict() for metrics in record.metrics()],
+        **({"step_ms": step_statistics(times, scenario.control_period_s)} if times else {}),
     }
 
 
@@ -109,8 +112,14 @@ def run_bench(
     processes: int = 1,
     ray_address: str | None = None,
     progress: Callable[[int, int], None] | None = None,
+    begin: Callable[[], None] = lambda: None,
 ) -> Results:
     """Run what is missing of a plan, here or on a Ray cluster.
+
+    Parameters
+    ----------
+    begin
+        Called once before the first episode, after the plan has been found to be valid.
 
     Raises
     ------
@@ -122,6 +131,7 @@ def run_bench(
     if find_spec("arch") is None:
         raise ValueError("the tables need arch (pip install 'tlf-env[bench]')")
     results = Results(folder, plan)
+    begin()
     todo = results.missing()
     total = len(plan.episodes())
     if progress is not None:

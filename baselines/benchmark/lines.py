@@ -34,3 +34,20 @@ def run_score(line: Line) -> float:
 def stratum_of(line: Line) -> Stratum:
     """Task, disturbance and swept value of a line."""
     return line["task"], line["disturbance"], line["sweep"]
+
+
+def step_times(lines: Sequence[Line]) -> dict[str, float] | None:
+    """Times of a step, ms: medians over the runs of their median and 99 % quantile, and the largest.
+
+    ``late`` is the share of all steps that took longer than a control period. None for policies whose time is
+    not measured.
+    """
+    times = [line["step_ms"] for line in lines if "step_ms" in line]
+    if not times:
+        return None
+    return {
+        "median": float(np.median([one["median"] for one in times])),
+        "p99": float(np.median([one["p99"] for one in times])),
+        "largest": max(one["largest"] for one in times),
+        "late": float(np.mean([one["late"] for one in times])),
+    }

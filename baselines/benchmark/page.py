@@ -10,6 +10,7 @@ from typing import Any
 from baselines.policies.registry import describe_overrides
 from baselines.policies.systems import parse_system
 
+MOST_LATE = 0.01  # share of late steps of an entry in real time
 # How `comparisons` are made; a leaderboard.json without the key `compared_by` has the second.
 PAIRED, OF_MEDIANS = "Medians of the differences", "Differences of medians"
 
@@ -34,6 +35,7 @@ def markdown(board: dict[str, Any], figures: Sequence[str] = ()) -> str:
         for row in board["policies"]
     ]
     parts.append("")
+    parts += time_table(board["policies"])
     parts += comparison_tables(board)
     tasks = dict.fromkeys(cell["task"] for cell in board["cells"])
     for task in tasks:
@@ -55,6 +57,28 @@ def markdown(board: dict[str, Any], figures: Sequence[str] = ()) -> str:
         parts.append("## Figures\n")
         parts += [f"![{figure_title(name)}]({name})\n" for name in figures]
     return "\n".join(parts)
+
+
+def time_table(rows: Sequence[dict[str, Any]]) -> list[str]:
+    """Time of a step of the entries that are processes of their own; nothing if there is none."""
+    timed = [row for row in rows if "step_ms" in row]
+    if not timed:
+        return []
+    return [
+        "## Time per step\n",
+        "From observations to actions, all robots of the row together, in ms: median over the runs of the "
+        "median and of the 99 % quantile, and the largest of all. Real time: at most 1 % of the steps take "
+        "longer than a control period.\n",
+        "| policy | median | 99 % | largest | late % | real time |",
+        "|---|---:|---:|---:|---:|---|",
+        *(
+            f"| {row['policy']} | {row['step_ms']['median']:.2f} | {row['step_ms']['p99']:.2f} | "
+            f"{row['step_ms']['largest']:.1f} | {100 * row['step_ms']['late']:.2f} | "
+            f"{'yes' if row['step_ms']['late'] <= MOST_LATE else 'no'} |"
+            for row in timed
+        ),
+        "",
+    ]
 
 
 def figure_title(name: str) -> str:

@@ -6,7 +6,7 @@ import math
 from collections.abc import Collection
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import SeedRange
@@ -47,6 +47,8 @@ class Plan:
     ``overrides`` are fields of every scenario; ``sweep`` is the path of a knob: a parameter of the disturbance,
     its ``level``, or a field of the scenario.
     """
+
+    unrecorded: ClassVar[tuple[str, ...]] = ("trust",)  # a permission, which changes no result
 
     policies: tuple[str, ...]
     tasks: tuple[str, ...]

@@ -57,7 +57,8 @@ def plan_record(plan: Plan) -> dict[str, Any]:
         for name in plan.policies:
             policies[name] = policy_hash(name, fit_policy(name, scenario, trust=plan.trust).policy)
     asked = asdict(plan)
-    del asked["trust"]  # a permission, which changes no result
+    for field in plan.unrecorded:
+        del asked[field]
     return {
         "plan": json.loads(json.dumps(asked)),
         "policies": policies,

@@ -11,10 +11,14 @@ from typing import Any, NamedTuple
 from pydantic import BaseModel
 
 from baselines.policies.card import WEIGHTS
-from baselines.policies.classical import CLASSICAL, Memoryless, make_classical
+from baselines.policies.entries import EntryPolicy, make_entry
+from baselines.policies.laws.catalogue import LAWS, make_law
+from baselines.policies.laws.law import Law
 from baselines.policies.learned import LearnedPolicy, load_policy, shipped_policies
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.systems import (
+    ENTRY,
+    ESTIMATORS,
     LimitedLaw,
     make_system,
     parse_system,
@@ -36,6 +40,8 @@ OVERRIDABLE = (
     "residual_reach_mm",
     "estimator",
     "ekf_slip",
+    "ekf_gyro",
+    "broadcast_smoothing_s",
     "preview_s",
     "rays",
 )
@@ -61,13 +67,13 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     ----------
     name
         ``reference`` or ``reference:GAINS``, where GAINS is a preset or the path of a controller file
-        (``.yaml``), ``pure_pursuit``, ``feedback_linearisation`` or ``kanayama`` (each also with
-        ``:PARAMETERS``, a preset or the path of a ``.yaml`` file), a system
-        ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the name of a shipped learned policy, the
-        path of a ``.safetensors`` file (with its card in the same folder), ``module:factory`` of an
-        object with SB3's ``predict``, or the path of an SB3 ``.zip`` file.
+        (``.yaml``), a law of :data:`LAWS` such as ``kanayama`` (each also with ``:PARAMETERS``, a preset or
+        the path of a ``.yaml`` file), a system ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the
+        name of a shipped learned policy, the path of a ``.safetensors`` file (with its card in the same
+        folder), ``module:factory`` of an object with SB3's ``predict``, ``entry:FOLDER`` of a
+        competition's entry, or the path of an SB3 ``.zip`` file.
     trust
-        Allow an SB3 ``.zip`` file: loading one runs code that it contains.
+        Allow an SB3 ``.zip`` file and an entry's program: both run code that is in them.
 
     Raises
     ------
@@ -113,8 +119,12 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
         }
         asked = {field: _plain(value) for field, value in differing.items()}
         scenario = fitted if asked else scenario
+        if "preview_s" in asked and isinstance(policy, Law | LimitedLaw):
+            policy = _made(name, scenario, trust=trust)  # a law is made for the previews
     if isinstance(policy, LearnedPolicy):
         policy.bind(name, scenario)
+    elif isinstance(policy, EntryPolicy):
+        policy.bind(scenario)
     return FittedPolicy(policy, scenario, asked)
 
 
@@ -149,16 +159,20 @@ def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
             f"policy {name!r}: scenario_overrides must map fields of {', '.join(OVERRIDABLE)}; "
             f"got {asked!r}"
         )
-    differs = parse_system(name) and scenario.estimator != asked["estimator"]
-    if differs and "estimator" in scenario.model_fields_set:
-        raise ValueError(
-            f"system {name!r} names the estimator {asked['estimator']!r}; the scenario sets "
-            f"{scenario.estimator!r}"
-        )
+    system = parse_system(name)
+    if system is not None:
+        for field, value in ESTIMATORS[system.estimator].items():
+            if field in scenario.model_fields_set and getattr(scenario, field) != value:
+                raise ValueError(
+                    f"system {name!r} names the {field} {value!r}; the scenario sets "
+                    f"{getattr(scenario, field)!r}"
+                )
     return {field: asked[field] for field in asked if field not in scenario.model_fields_set}
 
 
 def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
+    if name.startswith(ENTRY):
+        return make_entry(name, scenario, trust=trust)
     if name.lower().endswith(".zip"):
         return _stable_baselines(Path(name), scenario, trust=trust)
     if name.lower().endswith(WEIGHTS) or name in shipped_policies():
@@ -171,14 +185,14 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     if head == "reference" and name != "reference:":
         check_interface(name, scenario, action="twist", observation="tracking")
         return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
-    if head in CLASSICAL:
+    if head in LAWS:
         check_interface(name, scenario, action="twist", observation="tracking")
-        return make_classical(head, tail, scenario.preview_s, scenario.rays)
+        return make_law(head, tail, scenario)
     if tail:
         return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])
     raise ValueError(
-        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, FILE.zip"
+        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, {ENTRY}FOLDER, FILE.zip"
     )
 
 
@@ -218,15 +232,13 @@ def _hashed_content(path: Path) -> bytes:
 
 def _source_files(policy: Policy) -> list[Path]:
     """A learned policy's weights and card, or the file of the class and the controller file, if any."""
-    if isinstance(policy, LearnedPolicy):
+    if isinstance(policy, LearnedPolicy | EntryPolicy):
         return list(policy.files)
     try:
         source = inspect.getsourcefile(type(policy))
     except TypeError:
         return []
-    made_from = (
-        policy.files if isinstance(policy, ReferencePolicy | Memoryless | LimitedLaw) else ()
-    )
+    made_from = policy.files if isinstance(policy, ReferencePolicy | Law | LimitedLaw) else ()
     return [Path(source), *made_from] if source else []
 
 

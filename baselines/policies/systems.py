@@ -11,13 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from pydantic import ValidationError, field_validator
 
-from baselines.policies.classical import (
-    BOUNDS,
-    CLASSICAL,
-    Memoryless,
-    classical_names,
-    make_classical,
-)
+from baselines.policies.laws.catalogue import LAWS, law_names, make_law
+from baselines.policies.laws.law import BOUNDS, Law
 from baselines.policies.reference import ReferencePolicy
 from tlf_env.common.errors import one_line, suggestion
 from tlf_env.common.models import Frozen, NonNegative
@@ -29,7 +24,7 @@ from tlf_env.common.presets import (
 )
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.controllers import controller, controller_names
-from tlf_env.onboard.kinds import ESTIMATOR_KINDS
+from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.limiter import TwistLimits
 from tlf_env.onboard.parts import Policy
 from tlf_env.onboard.spacing import Spacing
@@ -38,7 +33,23 @@ from tlf_env.task.actions import ACTION_SIZE, twist_action
 from tlf_env.task.scenario import Scenario
 
 FORM = "CONTROLLER+ESTIMATOR or CONTROLLER+ESTIMATOR+LIMITER"
+ENTRY = "entry:"  # before the folder of a competition's entry
 NOT_LIMITED = (".zip", ".safetensors")  # learned policies, whose paths may contain a +
+
+
+BROADCAST_SMOOTHING_S = 0.1
+SMOOTHED: tuple[EstimatorKind, ...] = ("ekf", "ekf-slip", "ekf-gyro")
+# The fields of the scenario that an estimator's name sets: the filter on board, and what is broadcast of it.
+ESTIMATORS: dict[str, dict[str, Any]] = {
+    **{kind: {"estimator": kind} for kind in ESTIMATOR_KINDS},
+    **{
+        f"{kind}-smoothed": {
+            "estimator": kind,
+            "broadcast_smoothing_s": BROADCAST_SMOOTHING_S,
+        }
+        for kind in SMOOTHED
+    },
+}
 
 
 class SystemName(NamedTuple):
@@ -84,15 +95,15 @@ def parse_system(name: str) -> SystemName | None:
     ValueError
         naming the part, if the name has a ``+`` and no estimator behind it, or a part is empty.
     """
-    if "+" not in name or name.lower().endswith(NOT_LIMITED):
+    if "+" not in name or name.lower().endswith(NOT_LIMITED) or name.startswith(ENTRY):
         return None
-    kinds = "|".join(map(re.escape, ESTIMATOR_KINDS))
+    kinds = "|".join(map(re.escape, ESTIMATORS))
     found = re.match(rf"(?P<controller>.*?)\+(?P<estimator>{kinds})(?:\+(?P<limiter>.*))?$", name)
     if found is None:
         head, _, tail = name.partition("+")
         if ":" in head and is_file_name(name) and Path(name.partition(":")[2]).is_file():
             return None  # the path of one controller file
-        raise _unknown(name, "estimator", tail.partition("+")[0], ESTIMATOR_KINDS)
+        raise _unknown(name, "estimator", tail.partition("+")[0], ESTIMATORS)
     system = SystemName(**found.groupdict())
     if not system.controller:
         raise _unknown(name, "controller", "", system_controllers())
@@ -103,7 +114,7 @@ def parse_system(name: str) -> SystemName | None:
 
 def system_controllers() -> list[str]:
     """Names of the controllers that need no file."""
-    return [*(f"reference:{gains}" for gains in controller_names()), *classical_names()]
+    return [*(f"reference:{gains}" for gains in controller_names()), *law_names()]
 
 
 def limiters() -> list[str]:
@@ -156,7 +167,7 @@ class LimitedLaw:
     Parameters
     ----------
     law
-        A classical law, which wants a twist for each observation.
+        A tracking law, which wants a twist for each observation.
     limiter
         What its twist is limited by; its lead shifts the reference that the law sees.
     control_period_s
@@ -176,7 +187,7 @@ class LimitedLaw:
 
     def __init__(
         self,
-        law: Memoryless,
+        law: Law,
         limiter: Limiter,
         control_period_s: float,
         preview_s: tuple[float, ...],
@@ -192,7 +203,7 @@ class LimitedLaw:
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
-        """``twist`` action for one ``tracking`` observation or a batch, and ``state`` unchanged.
+        """``twist`` action for one ``tracking`` observation or a batch, and the law's next state.
 
         Raises
         ------
@@ -200,7 +211,13 @@ class LimitedLaw:
             as the law's ``wanted``.
         """
         observation = np.asarray(observation)
-        wanted = self.law.wanted(observation, self.limiter.lead_s)
+        wanted, state = self.law.wanted(
+            observation,
+            state,
+            episode_start,
+            lead_s=self.limiter.lead_s,
+            slip_cancelled=self.limiter.limits.cancel_slip,
+        )
         rows = np.ascontiguousarray(np.atleast_2d(observation))
         action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
         _limited(rows, self.law.scales, self._row, wanted, action)
@@ -210,9 +227,9 @@ class LimitedLaw:
 def make_system(system: SystemName, scenario: Scenario) -> Policy:
     """The policy of a system, for a scenario with ``tracking`` observations and ``twist`` actions.
 
-    Its ``scenario_overrides`` ask for the estimator, with the scenario's parameters whatever the
-    controller's file has, so that all controllers are compared on the same filter. A system on the true
-    state is privileged.
+    Its ``scenario_overrides`` ask for what the law asks for, and for the estimator, with the scenario's
+    parameters whatever the controller's file has, so that all controllers are compared on the same filter.
+    A system on the true state is privileged.
 
     Raises
     ------
@@ -229,24 +246,26 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
         files.append(path)
     head, _, tail = system.controller.partition(":")
     kind = "controller" if head == "reference" else head
-    known = kind == "controller" or kind in CLASSICAL
+    known = kind == "controller" or kind in LAWS
     path = preset_or_file(kind, tail) if known else None
     if not known or (path is None and system.controller != head):
         raise _unknown(name, "controller", system.controller, system_controllers())
-    files += [] if path is None else [path]
     policy: ReferencePolicy | LimitedLaw
+    asked: Mapping[str, Any] = {}
     period_s, preview_s = scenario.control_period_s, scenario.preview_s
     if kind == "controller":
         law = controller(tail or "consistent")
         whole = behind(law, own_limiter(law) if limiter is None else limiter)
         policy = ReferencePolicy(whole, period_s, preview_s)
+        files += [] if path is None else [path]
     else:
-        classical = make_classical(head, tail, preview_s, scenario.rays)
-        policy = LimitedLaw(classical, limiter or Limiter(), period_s, preview_s)
-        files.append(Path(inspect.getfile(type(classical))))
+        made = make_law(head, tail, scenario)
+        policy = LimitedLaw(made, limiter or Limiter(), period_s, preview_s)
+        asked = made.scenario_overrides
+        files += [Path(inspect.getfile(type(made))), *made.files]
     policy.files = tuple(files)
     policy.privileged = system.estimator == "truth"
-    policy.scenario_overrides = {"estimator": system.estimator}
+    policy.scenario_overrides = {**asked, **ESTIMATORS[system.estimator]}
     return policy
 
 

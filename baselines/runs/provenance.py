@@ -16,6 +16,7 @@ from tlf_env.numerics.compiled import PACKAGE, ROOMS_WITH_LAWS
 
 REPORTED_PACKAGES = ("tlf-env", "numpy", "numba", "gymnasium", "pettingzoo", "pymunk")
 PLACE_OPTIONS = ("--out", "--processes", "--workers", "--ray")
+SECRET_OPTIONS = ("--test-seed",)
 
 
 def installed_versions(packages: Iterable[str]) -> dict[str, str]:
@@ -77,9 +78,10 @@ def simulation_digest() -> str:
 
 
 def command_line(words: Sequence[str]) -> str:
-    """The ``tlf`` command with the given words, without the options that change no result.
+    """The ``tlf`` command with the given words, without the options that change no result, and without secrets.
 
-    Those options, ``--out``, ``--processes``, ``--workers`` and ``--ray``, set where the command runs.
+    The former, ``--out``, ``--processes``, ``--workers`` and ``--ray``, set where the command runs; the value
+    of ``--test-seed`` is replaced by dots.
     """
     kept = ["tlf"]
     skip = False
@@ -87,5 +89,9 @@ def command_line(words: Sequence[str]) -> str:
         if skip or word.split("=")[0] in PLACE_OPTIONS:
             skip = not skip and "=" not in word
             continue
+        if kept[-1] in SECRET_OPTIONS:
+            word = "..."
+        elif word.split("=")[0] in SECRET_OPTIONS and "=" in word:
+            word = f"{word.split('=')[0]}=..."
         kept.append(word)
     return " ".join(kept)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import Annotated, Any, Literal, Self
 from pydantic import Field, ValidationError, model_validator
 
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
+from baselines.runs.splits import check_choosing, check_training
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Whole
 from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
@@ -109,7 +111,8 @@ class TrainConfig(Frozen):
         Raises
         ------
         ValueError
-            for an invalid scenario, or one that cannot run in a batch.
+            for an invalid scenario, one that cannot run in a batch, or one that must not train
+            (:mod:`baselines.runs.splits`).
         """
         wanted = {name: share for name, share in self.disturbances.items() if share > 0}
         shares = [share for share in wanted.values() for _ in self.levels]
@@ -117,15 +120,26 @@ class TrainConfig(Frozen):
             task: [self._scenario(task, name, level) for name in wanted for level in self.levels]
             for task in self.tasks
         }
+        for scenario in itertools.chain.from_iterable(tasks.values()):
+            check_training(scenario)
         return tasks, shares
 
     def evaluation_scenarios(self) -> dict[tuple[str, str], Scenario]:
-        """Scenario of each task and disturbance of the evaluation."""
-        return {
+        """Scenario of each task and disturbance of the evaluation.
+
+        Raises
+        ------
+        ValueError
+            for an invalid scenario, or one that is for tests only (:mod:`baselines.runs.splits`).
+        """
+        scenarios = {
             (task, name): self._scenario(task, name, None, horizon_s=self.evaluation.horizon_s)
             for task in self.tasks
             for name in self.evaluation.disturbances
         }
+        for scenario in scenarios.values():
+            check_choosing(scenario)
+        return scenarios
 
     def named_scenarios(self) -> list[tuple[str, Scenario]]:
         """Every scenario of the training and of its evaluation, with its task and disturbance."""

@@ -14,15 +14,21 @@ from pydantic import (
     model_validator,
 )
 
+from baselines.policies.laws.catalogue import LAWS
+from baselines.policies.reference import ReferencePolicy
+from baselines.policies.systems import Limiter
 from baselines.runs.nested import value_at, with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
+from baselines.runs.splits import check_training
+from baselines.tuning.start import LawStart, named_start
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch, Whole
 from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
-from tlf_env.onboard.controllers import ControllerFile, controller
+from tlf_env.onboard.controllers import ControllerFile
 from tlf_env.onboard.kinds import EstimatorKind
+from tlf_env.onboard.parts import Policy
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
-from tlf_env.onboard.tracking import Controller, controller_row
+from tlf_env.onboard.tracking import Controller
 from tlf_env.task.metrics import ERROR_CAP_MM, FORMATION_SETTLE_S, LOST_RMS_MM
 from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -94,9 +100,13 @@ class Objective(Frozen):
 
 
 class TuneConfig(Frozen):
-    """A search. Paths are those of :class:`Controller` (``gains.k_1_per_s``) and of ``ekf_slip``."""
+    """A search.
 
-    start: Controller  # or the name of a preset; the first trial
+    Paths are those of :class:`Controller` (``gains.k_1_per_s``) and of ``ekf_slip``; for a law those of its
+    file (``law.gain_per_s``) and of its limiter (``limits.yaw_rate_rad_s``).
+    """
+
+    start: Controller | LawStart  # or the name of a controller, a law or a system; the first trial
     estimator: EstimatorKind = "ekf-slip"
     ekf_slip: SlipEkfParameters = SlipEkfParameters()
     search: dict[str, Range] = Field(min_length=1)
@@ -112,10 +122,25 @@ class TuneConfig(Frozen):
     stop_after_failed: Whole | None = Field(default=2, ge=1)
     objective: Objective = Objective()
 
-    @field_validator("start", mode="before")
+    @model_validator(mode="before")
     @classmethod
-    def _named(cls, value: Any) -> Any:
-        return controller(value) if isinstance(value, str) else value
+    def _named(cls, values: Any) -> Any:
+        given = values.get("start") if isinstance(values, dict) else None
+        if isinstance(given, dict):
+            kind = LawStart if "law" in given else Controller
+            try:
+                return {**values, "start": kind.model_validate(given)}
+            except ValidationError as error:
+                raise ValueError(f"start.{one_line(error, kind)}") from error
+        if not isinstance(given, str):
+            return values
+        start, estimator = named_start(given)
+        given = values.get("estimator", estimator)
+        if estimator is not None and given != estimator:
+            raise ValueError(
+                f"start {values['start']!r} names the estimator {estimator!r}; estimator is {given!r}"
+            )
+        return {**values, "start": start} | ({} if given is None else {"estimator": given})
 
     @field_validator("seeds", "choose", mode="after")
     @classmethod
@@ -132,7 +157,7 @@ class TuneConfig(Frozen):
             if len(set(names)) < len(names):
                 raise ValueError(f"{', '.join(names)}: each must be named once")
         for scenario in self.scenarios(self.ekf_slip).values():
-            controller_row(self.start, scenario.control_period_s, scenario.preview_s)
+            self.policy(self.start, scenario)
             settled = (scenario.robot_count - 1) * scenario.time_gap_s + FORMATION_SETTLE_S
             if self.objective.settled_formation_rmse_mm and self.horizon_s <= settled:
                 raise ValueError(
@@ -143,7 +168,15 @@ class TuneConfig(Frozen):
 
     def _check_paths(self) -> None:
         tree = self.tree
-        paths = [*_paths(Controller), *(f"ekf_slip.{path}" for path in _paths(SlipEkfParameters))]
+        if isinstance(self.start, LawStart):
+            if self.ekf_slip != SlipEkfParameters():
+                raise ValueError("ekf_slip: a law is searched with the scenario's filter")
+            model = LAWS[self.start.law][1]
+            paths = [f"law.{path}" for path in _paths(model) if path != "found"]
+            paths += _paths(Limiter)
+        else:
+            paths = _paths(Controller)
+            paths += [f"ekf_slip.{path}" for path in _paths(SlipEkfParameters)]
         for path, span in self.search.items():
             for named in (path, span.times):
                 if named is not None and named not in paths:
@@ -181,6 +214,8 @@ class TuneConfig(Frozen):
     @property
     def tree(self) -> dict[str, Any]:
         """The start's numbers as nested mappings, for the paths."""
+        if isinstance(self.start, LawStart):
+            return {"law": self.start.parameters, **self.start.limits_of_it.model_dump()}
         return {**self.start.model_dump(), "ekf_slip": self.ekf_slip.model_dump()}
 
     @property
@@ -194,8 +229,8 @@ class TuneConfig(Frozen):
             values[path] = value
         return values
 
-    def built(self, values: dict[str, float]) -> ControllerFile:
-        """The controller and its on-board parts for a value of each path of the search.
+    def built(self, values: dict[str, float]) -> ControllerFile | LawStart:
+        """The controller and its on-board parts, or the law, for a value of each path of the search.
 
         Raises
         ------
@@ -207,6 +242,12 @@ class TuneConfig(Frozen):
             times = self.search[path].times
             factor = 1.0 if times is None else value_at(tree, times)
             tree = with_value(tree, path, _rounded(values[path] * factor))
+        if isinstance(self.start, LawStart):
+            parameters = tree.pop("law")
+            try:
+                return self.start.with_numbers(parameters, tree)
+            except ValidationError as error:
+                raise ValueError(one_line(error, LawStart)) from error
         own = tree.pop("ekf_slip")
         slip = own if self.estimator == "ekf-slip" else None
         try:
@@ -216,15 +257,30 @@ class TuneConfig(Frozen):
         except ValidationError as error:
             raise ValueError(one_line(error, ControllerFile)) from error
 
+    def policy(self, made: Controller | ControllerFile | LawStart, scenario: Scenario) -> Policy:
+        """What a trial drives: the controller, or the law behind its limiter.
+
+        Raises
+        ------
+        ValueError
+            for a lead or a law that lacks a preview.
+        """
+        if isinstance(made, LawStart):
+            return made.policy(scenario)
+        law = made.controller if isinstance(made, ControllerFile) else made
+        return ReferencePolicy(law, scenario.control_period_s, scenario.preview_s)
+
     def scenarios(self, ekf_slip: SlipEkfParameters | None) -> dict[str, Scenario]:
         """The scenario of every task and disturbance, named ``"task, disturbance"``.
 
         Raises
         ------
         ValueError
-            for an unknown task or disturbance, or a scenario that the batch plant or the law cannot run.
+            for an unknown task or disturbance, one that must not tune
+            (:mod:`baselines.runs.splits`), or a scenario that the batch plant or the law cannot run.
         """
         made = {}
+        asked = self.start.scenario_overrides if isinstance(self.start, LawStart) else {}
         for task in self.tasks:
             for disturbance in self.disturbances:
                 scenario = load_scenario(
@@ -234,11 +290,13 @@ class TuneConfig(Frozen):
                     ekf_slip=None if ekf_slip is None else ekf_slip.model_dump(),
                     horizon_s=self.horizon_s,
                     plant="batch",
+                    **asked,
                 )
                 if (scenario.action, scenario.observation) != ("twist", "tracking"):
                     raise ValueError(
                         f"task {task!r} must have action 'twist', observation 'tracking'"
                     )
+                check_training(scenario)
                 made[f"{task}, {disturbance}"] = scenario
         return made
 
@@ -259,17 +317,34 @@ def _rounded(value: float) -> float:
     return float(f"{value:.{DIGITS}g}")
 
 
+def _read(source: str, before: tuple[str, ...]) -> dict[str, Any]:
+    """The keys of a search, with those of the search that it is like."""
+    if source in before:
+        raise ValueError(f"like: {' → '.join((*before, source))} goes round in a circle")
+    found = read_preset_or_file("search", source)
+    folder = Path(source).parent
+    if is_file_name(source) and "disturbances" in found:
+        found["disturbances"] = beside(folder, found["disturbances"])
+    other = found.pop("like", None)
+    if other is None:
+        return found
+    if not isinstance(other, str):
+        raise ValueError(f"like must be the name of a search or a .yaml file, got {other!r}")
+    other = beside(folder, other) if is_file_name(source) else other
+    return _read(other, (*before, source)) | found
+
+
 def load_tune(source: str | Path, *, trials: int | None = None) -> TuneConfig:
     """A search from a preset's name (``tuned``) or a YAML file; ``trials`` overrides their number.
+
+    With ``like: SEARCH`` a file has all keys of another search that it does not set itself.
 
     Raises
     ------
     ValueError
         in one line that names the value and what is allowed.
     """
-    found = read_preset_or_file("search", source)
-    if is_file_name(source) and "disturbances" in found:
-        found["disturbances"] = beside(Path(source).parent, found["disturbances"])
+    found = _read(str(source), ())
     try:
         given = {} if trials is None else {"trials": trials}
         return TuneConfig.model_validate(found | given)

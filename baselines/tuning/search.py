@@ -2,8 +2,9 @@
 
 A configuration names a start, ranges, tasks, disturbances and seeds. Optuna's tree-structured Parzen
 estimator proposes trials; every trial runs all tasks and disturbances on the batch plant. The best trials
-and the start are then run on other seeds, and the best of them is the result: a controller file that also
-records the scores of the result and of the start.
+and the start are then run on other seeds, and the best of them is the result: a controller file, or the file
+of a law, that also records the scores of the result and of the start. A law's limiter has a file of its own
+if the search changed it.
 """
 
 from __future__ import annotations
@@ -15,12 +16,13 @@ from typing import Any
 from baselines.runs.jobs import alone_in, spread
 from baselines.runs.provenance import git_revision, simulation_digest, versions
 from baselines.tuning.config import TuneConfig
+from baselines.tuning.start import LawStart
 from baselines.tuning.study import StoredStudy, optuna_package
 from baselines.tuning.trial import Outcome, TrialJob, run_trial
 from tlf_env.common.files import atomic
 from tlf_env.common.presets import yaml_text
 
-RESULT_FILE = "tuned.yaml"
+RESULT_FILE, LIMITER_FILE = "tuned.yaml", "limiter.yaml"
 
 
 def run_tune(
@@ -58,8 +60,30 @@ def run_tune(
     with alone_in(folder):
         chosen = _search(study, workers, ray_address, progress or (lambda done, total: None))
         result = _result(study, chosen, command)
-        _write(result, folder / RESULT_FILE)
+        use = use_of(config)
+        if _limiter_is_searched(config):
+            best = config.built(study.values(result["found"]["trial"]))
+            assert isinstance(best, LawStart)
+            _write(best.limits_of_it.model_dump(mode="json"), folder / LIMITER_FILE, use)
+        _write(result, folder / RESULT_FILE, use)
     return result
+
+
+def use_of(config: TuneConfig, folder: Path | None = None) -> str:
+    """The policy's name with the result in a folder; with FILE in place of its path without one."""
+    path, limiter_path = "FILE", "LIMITER.yaml"
+    if folder is not None:
+        path, limiter_path = str(folder / RESULT_FILE), str(folder / LIMITER_FILE)
+    if not isinstance(config.start, LawStart):
+        return f"reference:{path}"
+    limiter = limiter_path if _limiter_is_searched(config) else config.start.limiter or "none"
+    return f"{config.start.law}:{path}+{config.estimator}+{limiter}"
+
+
+def _limiter_is_searched(config: TuneConfig) -> bool:
+    return isinstance(config.start, LawStart) and any(
+        not p.startswith("law.") for p in config.search
+    )
 
 
 def _search(
@@ -88,12 +112,14 @@ def _search(
 
 
 def _result(study: StoredStudy, chosen: dict[int, Outcome], command: str) -> dict[str, Any]:
-    """The content of ``tuned.yaml``: a controller file, and how it was found."""
+    """The content of ``tuned.yaml``: a controller's or a law's file, and how it was found."""
     config = study.config
     ranking = sorted(chosen.values(), key=lambda outcome: (outcome.score, outcome.number))
     best = ranking[0].number
     tuned = {outcome.number: outcome for outcome in study.outcomes()}
-    file = config.built(study.values(best)).model_dump(mode="json", exclude={"found"})
+    made = config.built(study.values(best))
+    made_file = made.file if isinstance(made, LawStart) else made
+    file = made_file.model_dump(mode="json", exclude={"found"})
     return {
         **{key: value for key, value in file.items() if value is not None},
         "found": {
@@ -128,7 +154,7 @@ def _recorded(outcome: Outcome) -> dict[str, Any]:
     return kept
 
 
-def _write(result: dict[str, Any], path: Path) -> None:
+def _write(result: dict[str, Any], path: Path, use: str) -> None:
     with atomic(path, encoding="utf-8") as file:
-        file.write("# Found by tlf tune. Use it with --policy reference:FILE.\n")
+        file.write(f"# Found by tlf tune. Use it with --policy {use}.\n")
         file.write(yaml_text(result))

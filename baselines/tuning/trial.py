@@ -7,10 +7,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from baselines.policies.reference import ReferencePolicy
 from baselines.runs.outcome import failed
 from baselines.runs.run import Record, run_seeds, seed_blocks
 from baselines.tuning.config import CAPS, TuneConfig
+from tlf_env.onboard.controllers import ControllerFile
 
 
 class TrialJob(NamedTuple):
@@ -36,12 +36,12 @@ class Outcome(NamedTuple):
 
 def run_trial(config: TuneConfig, job: TrialJob) -> Outcome:
     """Run a trial through all tasks and disturbances, a block of seeds at once."""
-    file = config.built(job.values)
+    made = config.built(job.values)
     strata: dict[str, dict[str, float]] = {}
     fails = 0
-    scenarios = config.scenarios(file.ekf_slip)
+    scenarios = config.scenarios(made.ekf_slip if isinstance(made, ControllerFile) else None)
     for place, scenario in scenarios.items():
-        policy = ReferencePolicy(file.controller, scenario.control_period_s, scenario.preview_s)
+        policy = config.policy(made, scenario)
         rows = [
             measured(record)
             for seeds in seed_blocks(job.seeds)

@@ -29,6 +29,10 @@ KINDS = {
     "pure_pursuit": "laws/pure_pursuit",
     "feedback_linearisation": "laws/feedback_linearisation",
     "kanayama": "laws/kanayama",
+    "lqr": "laws/lqr",
+    "sliding_mode": "laws/sliding_mode",
+    "adrc": "laws/adrc",
+    "nmpc": "laws/nmpc",
 }  # kinds of preset, and the subfolder of each
 SUFFIXES = (".yaml", ".yml")
 MOST_LEVELS = 50  # of mappings and lists in each other

@@ -18,14 +18,16 @@ from tlf_env.engine.layout import (
     Kind,
     Sample,
     Traction,
+    Way,
     array_reader,
     array_writer,
     fields_of,
     rows_of,
 )
-from tlf_env.numerics.rows import reader, writer
+from tlf_env.numerics.rows import reader, slot_reader, slot_writer, writer
 from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.estimator import ekf_constants
+from tlf_env.onboard.gyro_estimator import gyro_ekf_constants
 from tlf_env.onboard.observer import Message, Reference
 from tlf_env.onboard.slip_estimator import slip_ekf_constants
 from tlf_env.onboard.speed_observer import speed_observer_row
@@ -86,6 +88,9 @@ class Arrays(NamedTuple):
     fixes: np.ndarray  # (Fix, slot, robot, lane): ring over the longest delay of the fixes
     dropped: np.ndarray  # (slot, robot, lane) bool: whether that broadcast was lost
     messages: np.ndarray  # (Message, slot, robot, lane): ring over one gap
+    ways: (
+        np.ndarray
+    )  # (Way, slot, robot, lane): ring over the windows of smoothed broadcasts, or none
     references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
     paths: np.ndarray  # (x y, slot, robot, lane): true positions, ring over one gap and a window
     longest: np.ndarray  # (robot, lane): longest distance within a control step so far, mm
@@ -138,6 +143,10 @@ read_slip_ekf, write_slip_ekf = array_reader("slip_ekf"), array_writer("slip_ekf
 read_motion, write_motion = array_reader("motion"), array_writer("motion")
 read_estimate, write_estimate = array_reader("estimate"), array_writer("estimate")
 read_slip = array_reader("slip")
+read_ekf = array_reader("ekf")
+read_sensors = array_reader("sensors")
+read_way, write_way = slot_reader(Way), slot_writer(Way)
+read_message, write_message = slot_reader(Message), slot_writer(Message)
 read_contact = array_reader("contact")
 read_trace, write_trace = array_reader("trace"), array_writer("trace")
 read_traction, write_traction = reader(Traction), writer(Traction)  # of Arrays.inputs
@@ -158,11 +167,17 @@ def constant_rows(scenario: Scenario) -> dict[str, Sequence[tuple[float, ...]]]:
         loop = WheelLoopParameters()
     robots, dt_s = scenario.robot_models, scenario.physics_period_s
     bodies = [body(robot) for robot in robots]
+    filters = [slip_ekf_constants(scenario.ekf_slip, dt_s)] * len(robots)
+    if scenario.estimator == "ekf-gyro":
+        gyro = scenario.ekf_gyro
+        if scenario.plant == "kinematic":  # there are no torques
+            gyro = gyro.model_copy(update={"torque_time_s": None})
+        filters = [gyro_ekf_constants(gyro, one, dt_s) for one in bodies]
     return {
         "body": bodies,
         "wheel_loop": [digital_wheel_loop(loop, dt_s)] * len(robots),
         "ekf": [ekf_constants(scenario.ekf)] * len(robots),
-        "slip_ekf": [slip_ekf_constants(scenario.ekf_slip, dt_s)] * len(robots),
+        "slip_ekf": filters,
         "belief": [Belief(radius_l=1.0, radius_r=1.0, h=one.h) for one in bodies],
         "speed_observer": [
             speed_observer_row(loop.speed_observer_rad_s, one, dt_s) for one in bodies
@@ -215,6 +230,12 @@ def padded(lanes: int) -> int:
         return lanes
     cache_lines = -(-lanes // DOUBLES_PER_CACHE_LINE)
     return DOUBLES_PER_CACHE_LINE * (cache_lines | 1)
+
+
+def smoothing_slots(scenario: Scenario, old: int) -> int:
+    """Control steps in the ring of ways, if fixes are at most ``old`` substeps late; 0 without smoothing."""
+    half = scenario.smoothing_steps
+    return 4 * half + -(-old // scenario.substeps) + 4 if half else 0
 
 
 def make_arrays(
@@ -274,6 +295,7 @@ def make_arrays(
         fixes=np.zeros((len(Fix._fields), old + 1, robots, columns)),
         dropped=np.zeros((ring, robots, columns), dtype=np.bool_),
         messages=np.zeros((len(Message._fields), ring, robots, columns)),
+        ways=np.zeros((len(Way._fields), smoothing_slots(scenario, old), robots, columns)),
         references=np.zeros((len(Reference._fields), lookahead + 1, robots, columns)),
         paths=np.zeros((2, gap + window + 1, robots, columns)),
         longest=np.zeros((robots, columns)),

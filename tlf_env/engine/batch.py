@@ -26,7 +26,7 @@ from tlf_env.task.warn import warn_of
 
 Source = str | Path | Mapping[str, Any] | Scenario
 
-MAY_DIFFER = ("name", "robots", "robot", "wheel_loop", "ekf", "ekf_slip", "disturbance")
+MAY_DIFFER = ("name", "robots", "robot", "wheel_loop", "ekf", "ekf_slip", "ekf_gyro", "disturbance")
 
 
 class BatchPlant:
@@ -42,7 +42,8 @@ class BatchPlant:
     scenario
         What :func:`~tlf_env.task.scenario.load_scenario` takes, or a sequence of it: formation k then
         runs scenario k modulo their number. They may differ in ``robots``' parameters, ``robot``,
-        ``wheel_loop``, ``ekf``, ``ekf_slip`` and ``disturbance``. A ``kinematic`` plant stays one.
+        ``wheel_loop``, ``ekf``, ``ekf_slip``, ``ekf_gyro`` and ``disturbance``. A ``kinematic`` plant stays
+        one.
     formations
         How many.
     threads

@@ -40,11 +40,13 @@ from tlf_env.engine.outlines import away_from_walls, mark_touched, room_to_move,
 from tlf_env.engine.radio import broadcast, delayed_message, next_reference
 from tlf_env.engine.rays import capsule_at, cast_rays, is_reading, meet, report_rays
 from tlf_env.engine.settings import Settings
+from tlf_env.engine.smoothing import smooth
 from tlf_env.engine.starting import STARTED, clear, start_lane
 from tlf_env.engine.substeps import trace_drive
 from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import block, driver, fetch_add, law
 from tlf_env.numerics.philox import unit, words
+from tlf_env.onboard.kinds import TRUTH
 from tlf_env.onboard.observer import Message
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 from tlf_env.task.actions import (
@@ -151,6 +153,8 @@ def transmit_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
     arrays.clock[lane, 1] = step
     for robot in range(arrays.states.shape[1]):
         broadcast(arrays, lane, robot, step, settings)
+        if settings.half_window > 0 and settings.estimator != TRUTH:
+            smooth(arrays, lane, robot, step, settings)
         record_truth(arrays, lane, robot, step)
 
 

@@ -61,6 +61,8 @@ class Trace(NamedTuple):
     innovation_right: float
     nis: float  # sum of the normalised innovation squared
     fixes: float  # number of position fixes
+    off_x: float  # sums of the fixes minus the estimator's way when they were measured, mm
+    off_y: float
     torque_l: float  # sums, mN·mm
     torque_r: float
     saturated: float  # substeps with a torque at its limit
@@ -83,6 +85,24 @@ class Pose(NamedTuple):
     x: float
     y: float
     theta: float
+
+
+class Way(NamedTuple):
+    """A robot's dead reckoning at the end of a control step, and what was found for it later."""
+
+    x: float  # the estimator's way, mm
+    y: float
+    turn: float  # turns since the start, rad
+    theta: float  # the filter's heading, rad
+    off_x: float  # sums of the step's fixes minus the way when they were measured, mm
+    off_y: float
+    fixes: float  # their number
+    p_x: float  # smoothed position, mm
+    p_y: float
+    v_x: float  # smoothed velocity, mm/s
+    v_y: float
+    heading: float  # smoothed heading minus ``turn``, rad
+    fitted: float  # 1 if there is a smoothed position, else 0
 
 
 class Sample(NamedTuple):

@@ -8,16 +8,17 @@ from tlf_env.disturbances.channels import DROPOUT, JITTER, RADIO_DROPOUT, RADIO_
 from tlf_env.engine.arrays import (
     Arrays,
     read_estimate,
+    read_message,
     read_motion,
     read_observer,
     read_trace,
+    write_message,
     write_observer,
 )
 from tlf_env.engine.layout import Pose
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.philox import unit, words
-from tlf_env.numerics.rows import slot_reader, slot_writer
 from tlf_env.onboard.kinds import TRUTH
 from tlf_env.onboard.observer import (
     Message,
@@ -28,9 +29,6 @@ from tlf_env.onboard.observer import (
     smoothing,
 )
 from tlf_env.physics.vehicle import forward_and_yaw
-
-read_message = slot_reader(Message)
-write_message = slot_writer(Message)
 
 
 @law

@@ -32,7 +32,8 @@ from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.numerics.rows import replacing
 from tlf_env.onboard.calibration import Belief, believed_odometry
 from tlf_env.onboard.estimator import Ekf, Estimate, correct, predict
-from tlf_env.onboard.kinds import EKF, EKF_SLIP, TRUTH
+from tlf_env.onboard.gyro_estimator import correct_with_gyro, predict_with_gyro
+from tlf_env.onboard.kinds import EKF, EKF_GYRO, EKF_SLIP, TRUTH
 from tlf_env.onboard.slip_estimator import (
     SlipEkf,
     SlipEstimate,
@@ -76,6 +77,8 @@ with_sensor_sums = replacing(
     "innovation_right",
     "nis",
     "fixes",
+    "off_x",
+    "off_y",
 )
 
 
@@ -205,6 +208,18 @@ def sense_robot(
         x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
         y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
         estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y, fix.here)
+    elif kind == EKF_GYRO:
+        before_x, before_y = estimate.x, estimate.y
+        torque = commanded.left + commanded.right
+        estimate, slip = predict_with_gyro(
+            estimate, slip, slip_ekf, u_1, yaw_rate.reading, torque, dt
+        )
+        way_x, way_y = way_x + (estimate.x - before_x), way_y + (estimate.y - before_y)
+        x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
+        y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
+        estimate, slip, d_x, d_y, nis = correct_with_gyro(
+            estimate, slip, slip_ekf, x, y, fix.here, u_2, yaw_rate.reading, dt
+        )
     elif kind == TRUTH:
         true_x, true_y = axle_midpoint(motion, body.d)
         ahead, yaw = forward_and_yaw(motion)
@@ -221,6 +236,12 @@ def sense_robot(
             p_yt=0.0,
             p_tt=0.0,
         )
+    moved = trace.moved + u_1 - slip.spin_1 + slip.delta_1 * dt
+    turned = trace.turned + u_2 - slip.spin_2 + slip.delta_2 * dt
+    if kind == EKF_GYRO:
+        moved = trace.moved + slip.advance + slip.speed_error * dt
+        turned = trace.turned + (yaw_rate.reading + slip.gyro_error) * dt
+    from_x, from_y = (fix.way_x, fix.way_y) if fix.age > 0.0 else (way_x, way_y)
     forward, right = body_errors(d_x, d_y, estimate.theta)
     return (
         Sensors(
@@ -237,12 +258,14 @@ def sense_robot(
             trace,
             trace.distance + u_1,
             trace.turn + u_2,
-            trace.moved + u_1 - slip.spin_1 + slip.delta_1 * dt,
-            trace.turned + u_2 - slip.spin_2 + slip.delta_2 * dt,
+            moved,
+            turned,
             trace.innovation_forward + fix.here * forward,
             trace.innovation_right + fix.here * right,
             trace.nis + nis,
             trace.fixes + fix.here,
+            trace.off_x + fix.here * (fix.x - from_x),
+            trace.off_y + fix.here * (fix.y - from_y),
         ),
         Sample(
             fix_x=fix.x,

@@ -30,12 +30,15 @@ class Settings(NamedTuple):
     horizon: int  # control steps of an episode
     spacing: float  # mm between neighbours at the start
     window: int  # control steps around one gap ago in which the time gap is measured
+    half_window: (
+        int  # control steps before and after a moment that a smoothed broadcast uses; 0: none
+    )
     observer_gain: float  # 1/s
     smoothing: float  # s
     lost_beyond: float  # mm
     end_on_lost: bool
     end_on_touched: bool
-    estimator: int  # EKF, TRUTH, EXTERNAL or EKF_SLIP
+    estimator: int  # EKF, TRUTH, EXTERNAL, EKF_SLIP or EKF_GYRO
     has_parts: bool  # objects in Python that are called between the substeps
     external_wheel_loop: bool
     external_observer: bool
@@ -68,6 +71,7 @@ def make_settings(scenario: Scenario) -> Settings:
         horizon=scenario.horizon_steps,
         spacing=scenario.start_spacing_mm,
         window=round(TIME_GAP_WINDOW_S / scenario.control_period_s),
+        half_window=scenario.smoothing_steps,
         observer_gain=paper.gain_per_s,
         smoothing=paper.smoothing_s,
         lost_beyond=scenario.lost_beyond_mm,

@@ -33,6 +33,7 @@ from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.estimator import EkfParameters
+from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import PART_PATTERN
@@ -148,6 +149,10 @@ class Scenario(Frozen):
     estimator: EstimatorKind | PartPath = "ekf"
     ekf: EkfParameters = EkfParameters()
     ekf_slip: SlipEkfParameters = SlipEkfParameters()
+    ekf_gyro: GyroEkfParameters = GyroEkfParameters()
+    # Smoothed broadcasts: a robot sends, beside its pose now, the one of a short time ago, from the position
+    # fixes of this time before and after. 0: only its pose now.
+    broadcast_smoothing_s: NonNegative = 0.0
     observer: ObserverParameters | PartPath = ObserverParameters()
 
     disturbance: Disturbance = Disturbance()
@@ -268,6 +273,7 @@ class Scenario(Frozen):
                     f"preview_s {time_s} must be a multiple of control_period_s "
                     f"{self.control_period_s}"
                 )
+        self._check_smoothing()
         room_mm = 2 * max(robot.outline_radius_mm for robot in self.robot_models)
         if self.robot_count > 1 and self.start_spacing_mm < room_mm + START_MARGIN_MM:
             raise ValueError(
@@ -350,6 +356,23 @@ class Scenario(Frozen):
         """Whether observations use the true state."""
         return self.estimator == "truth"
 
+    def _check_smoothing(self) -> None:
+        half_s, period_s = self.broadcast_smoothing_s, self.control_period_s
+        if not half_s:
+            return
+        if whole_steps(half_s, period_s) in (None, 0):
+            raise ValueError(
+                f"broadcast_smoothing_s {half_s} must be a multiple of control_period_s {period_s}"
+            )
+        delay = self.disturbance.signal("position.delay_s").reach()[1] * self.disturbance.level
+        late_s = 2 * half_s + math.ceil(delay / period_s) * period_s + period_s
+        room_s = self.time_gap_s - max(self.preview_s, default=0.0)
+        if late_s > room_s:
+            raise ValueError(
+                f"broadcast_smoothing_s {half_s} makes broadcasts {late_s:g} s late; followers use them "
+                f"after {room_s:g} s (time_gap_s less the longest preview_s)"
+            )
+
     @property
     def substeps(self) -> int:
         """Physics steps per control step."""
@@ -369,6 +392,11 @@ class Scenario(Frozen):
     def preview_steps(self) -> tuple[int, ...]:
         """Control steps to each preview."""
         return tuple(round(time_s / self.control_period_s) for time_s in self.preview_s)
+
+    @property
+    def smoothing_steps(self) -> int:
+        """Control steps before and after a moment that a smoothed broadcast uses."""
+        return round(self.broadcast_smoothing_s / self.control_period_s)
 
     @property
     def settle_s(self) -> float:

@@ -1,11 +1,11 @@
-"""The classical policies: exact on an exact reference, their gains, and that they hold the tasks."""
+"""The laws of textbooks: their gains, and that they hold the tasks."""
 
 import math
 
 import numpy as np
 import pytest
 
-from baselines.policies.classical import FeedbackLinearisation, Kanayama, PurePursuit
+from baselines.policies.laws.textbook import FeedbackLinearisation, Kanayama, PurePursuit
 from baselines.policies.registry import fit_policy, make_policy
 from baselines.runs.run import run_policy
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
@@ -13,8 +13,6 @@ from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
 
 ENTRIES = tracking_entries(DEFAULT_PREVIEW_S)
-RIVALS = [PurePursuit, FeedbackLinearisation, Kanayama]
-TWISTS = [(400.0, 0.0), (300.0, 0.5), (250.0, -0.8), (0.0, 0.0)]
 
 
 def row(**seen):
@@ -23,27 +21,8 @@ def row(**seen):
     return np.array([values.get(name, 0.0) / entry.scale for name, entry in ENTRIES.items()])
 
 
-def ahead(u_1, u_2, time_s):
-    """Forward and right of where a robot with that twist will be."""
-    turn = u_2 * time_s
-    if abs(u_2) < 1e-12:
-        return u_1 * time_s, 0.0
-    return u_1 / u_2 * math.sin(turn), -u_1 / u_2 * (1 - math.cos(turn))
-
-
 def twist_of(action):
     return action * (FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S)
-
-
-@pytest.mark.parametrize("rival", RIVALS)
-@pytest.mark.parametrize("twist", TWISTS)
-def test_without_error_the_twist_is_the_references(rival, twist):
-    forward, right = ahead(*twist, 0.5)
-    places = {"forward_in_0.5_s": forward, "right_in_0.5_s": right}
-    seen = row(reference_u_1=twist[0], reference_u_2=twist[1], **places)
-    action, state = rival().predict(seen, "memory")
-    assert twist_of(action) == pytest.approx(twist, abs=1e-9)
-    assert state == "memory"
 
 
 @pytest.mark.parametrize("gain", [0.5, 2.0])
@@ -76,23 +55,6 @@ def test_the_error_of_the_point_ahead_decays_with_the_gain(gain):
         robot = moved(robot, *policy.twist({name: np.float64(x) for name, x in seen.items()}))
         goal = moved(goal, u_1, u_2)
     assert point(goal) - point(robot) == pytest.approx(math.exp(-gain) * first, abs=0.3)
-
-
-@pytest.mark.parametrize("rival", RIVALS)
-def test_a_batch_is_its_rows(rival):
-    rows = np.random.default_rng(0).uniform(-1, 1, (6, len(ENTRIES))).astype(np.float32)
-    policy = rival()
-    batch, _ = policy.predict(rows)
-    assert batch.dtype == np.float32
-    assert np.abs(batch).max() <= 1
-    np.testing.assert_array_equal(batch, [policy.predict(one)[0] for one in rows])
-
-
-@pytest.mark.parametrize("rival", RIVALS)
-@pytest.mark.parametrize("shape", [(), (3,), (2, len(ENTRIES) + 1), (1, 1, len(ENTRIES))])
-def test_a_wrong_shape_is_reported(rival, shape):
-    with pytest.raises(ValueError, match="takes tracking observations of"):
-        rival().predict(np.zeros(shape))
 
 
 @pytest.mark.parametrize("speed_mm_s", [100.0, 400.0])

@@ -1,0 +1,101 @@
+"""Active disturbance rejection: what its observer finds, how fast, and that it is subtracted."""
+
+import math
+
+import numpy as np
+import pytest
+
+from baselines.policies.laws.disturbance_rejection import DisturbanceRejection
+from baselines.policies.laws.law import ErrorBounds
+from baselines.policies.laws.textbook import FeedbackLinearisation
+from tlf_env.task.observation import tracking_entries
+from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S, DEFAULT_PREVIEW_S
+
+ENTRIES = tracking_entries(DEFAULT_PREVIEW_S)
+T = DEFAULT_CONTROL_PERIOD_S
+D_1, D_2 = 2, 3  # places in the memory
+
+
+def moved(pose, twist):
+    """A pose (x, y, θ; 0 faces +y) after a control period with a constant twist."""
+    u_1, u_2 = twist
+    turn = 0.5 * u_2 * T
+    chord = u_1 * T * (math.sin(turn) / turn if turn else 1.0)
+    middle = pose[2] + turn
+    step = [-chord * math.sin(middle), chord * math.cos(middle), u_2 * T]
+    return pose + np.array(step)
+
+
+def driven(law, slip=(0.0, 0.0), steps=400, start=(0.0, 0.0, 0.0), told=(0.0, 0.0)):
+    """Errors ``(step, 3)`` and memories of a robot that slips, and whose wheels follow at once."""
+    robot, goal, wheels = np.array(start), np.zeros(3), np.array([300.0, 0.3])
+    state, errors, memories = None, [], []
+    for _ in range(steps):
+        (d_x, d_y, e_3), theta = goal - robot, robot[2]
+        sin, cos = math.sin(theta), math.cos(theta)
+        e_1, e_2 = -sin * d_x + cos * d_y, cos * d_x + sin * d_y
+        errors.append((e_1, e_2, e_3))
+        seen = {"e_1": e_1, "e_2": e_2, "sin_e_3": math.sin(e_3), "cos_e_3": math.cos(e_3)}
+        for i in (1, 2):
+            seen |= {f"reference_u_{i}": (300.0, 0.3)[i - 1], f"slip_{i}": told[i - 1]}
+            seen |= {f"odometry_u_{i}": wheels[i - 1], f"command_u_{i}": wheels[i - 1]}
+        row = [seen.get(name, 0.0) / entry.scale for name, entry in ENTRIES.items()]
+        wanted, state = law.wanted(np.array(row), state, slip_cancelled=any(told))
+        memories.append(state[0])
+        wheels = wanted[0] - told
+        robot, goal = moved(robot, wheels + slip), moved(goal, (300.0, 0.3))
+    return np.array(errors), np.array(memories)
+
+
+@pytest.mark.parametrize("slip", [(60.0, 0.0), (0.0, -0.4), (-40.0, 0.3)])
+def test_a_constant_slip_is_found_and_leaves_no_error(slip):
+    errors, memories = driven(DisturbanceRejection(), slip)
+    np.testing.assert_allclose(memories[-1, [D_1, D_2]], slip, rtol=0.02, atol=0.02)
+    assert np.abs(errors[-1, :2]).max() < 0.5
+    plain, _ = driven(DisturbanceRejection(bandwidth_rad_s=1e-9), slip)
+    assert np.hypot(*plain[-1, :2]) > 15.0  # without an observer it does
+
+
+@pytest.mark.parametrize("bandwidth", [2.0, 10.0])
+def test_the_observer_has_two_poles_at_its_bandwidth(bandwidth):
+    """The error x of the estimate obeys x[k + 2] − 2β x[k + 1] + β² x[k] = 0."""
+    _, memories = driven(DisturbanceRejection(bandwidth_rad_s=bandwidth), (50.0, 0.0), 100)
+    left = 50.0 - memories[1:, D_1]
+    beta = math.exp(-bandwidth * T)
+    np.testing.assert_allclose(left[2:], 2 * beta * left[1:-1] - beta**2 * left[:-2], atol=0.05)
+    assert left[0] == pytest.approx(50.0 * (1 - (1 - beta) ** 2), rel=1e-3)
+
+
+def test_without_slip_it_is_feedback_linearisation():
+    start = (10.0, -20.0, 0.2)
+    errors, memories = driven(DisturbanceRejection(), start=start, steps=200)
+    assert np.abs(memories[:, D_1]).max() < 0.05
+    assert np.abs(memories[:, D_2]).max() < 0.002
+
+    class Plain(FeedbackLinearisation):
+        def wanted(self, *given, **named):
+            return super().wanted(*given, **named)[0], [np.zeros(6)]
+
+    plain, _ = driven(Plain(ahead_mm=80.0, gain_per_s=1.3), start=start, steps=200)
+    np.testing.assert_allclose(errors, plain, atol=0.05)
+
+
+def test_a_slip_that_is_subtracted_behind_the_law_is_not_found_again():
+    slip = (50.0, -0.3)
+    errors, memories = driven(DisturbanceRejection(), slip, told=slip)
+    assert np.abs(memories[:, [D_1, D_2]]).max() < 0.05
+    assert np.abs(errors[-1]).max() < 0.05
+
+
+def test_the_estimate_is_bounded():
+    law = DisturbanceRejection(most_slip_mm_s=30.0, most_slip_rad_s=0.1)
+    _, memories = driven(law, (60.0, 0.4), 100)
+    assert memories[:, D_1].max() == 30.0
+    assert memories[:, D_2].max() == 0.1
+
+
+def test_the_observer_sees_the_errors_without_bounds():
+    bounds = ErrorBounds(forward_error_mm=20.0, lateral_error_mm=20.0)
+    _, memories = driven(DisturbanceRejection(bounds=bounds), start=(200.0, -300.0, 0.5), steps=150)
+    assert np.abs(memories[:, D_1]).max() < 0.3
+    assert np.abs(memories[:, D_2]).max() < 0.01
