@@ -62,7 +62,7 @@ def run(
             help="reference[:GAINS], reference:FILE.yaml, pure_pursuit, feedback_linearisation, kanayama, "
             "lqr, sliding_mode, adrc, nmpc, CONTROLLER+ESTIMATOR+LIMITER of these (e.g. "
             "kanayama+ekf-slip+body), the name of a shipped policy, FILE.safetensors (with FILE.json), "
-            "module:factory, FILE.zip (with --trust)."
+            "module:factory; with --trust FILE.zip and entry:FOLDER (a competition's entry)."
         ),
     ] = "reference",
     gains: Annotated[
@@ -105,7 +105,10 @@ def run(
     mat: Annotated[bool, typer.Option("--mat", help="Write trajectory.mat, too.")] = False,
     trust: Annotated[
         bool,
-        typer.Option("--trust", help="Load an SB3 .zip file; loading runs code that it contains."),
+        typer.Option(
+            "--trust",
+            help="Load an SB3 .zip file or run an entry's program: code that they contain.",
+        ),
     ] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json instead of the table.")

@@ -192,7 +192,7 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         return make_part("policy", name, load_part(name))
     names = ", ".join([*policy_names(), *shipped_policies()])
     raise ValueError(
-        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, {ENTRY}FOLDER, FILE.zip"
+        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, FILE.zip, {ENTRY}FOLDER"
     )
 
 

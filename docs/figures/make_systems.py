@@ -1,7 +1,8 @@
 """Controllers, estimators and limiters crossed: the tables of ``docs/systems.md``.
 
 ``python docs/figures/make_systems.py`` drives 8 seeds of each cell for 60 s on the batch plant; it takes about
-a quarter of an hour on one core and needs no extra. ``--seeds N`` drives more. ``--rivals`` makes the table of
+a quarter of an hour on one core and needs no extra. ``--seeds N`` drives more, ``--only ESTIMATOR`` one table.
+``--rivals`` makes the table of
 the rivals instead, on seeds for choosing and with the processor time of each law; ``--rivals LAW`` only its
 rows.
 """
@@ -23,7 +24,6 @@ from baselines.policies.registry import fit_policy
 from baselines.policies.systems import SystemName
 from baselines.runs.run import run_policy
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, FIRST_TABLE_SEED
-from tlf_env.onboard.kinds import ESTIMATOR_KINDS
 from tlf_env.task.scenario import load_scenario
 
 CONTROLLERS = (
@@ -42,6 +42,7 @@ RIVAL_LIMITERS = ("none", "body")
 RIVAL_ESTIMATORS = ("ekf-slip", "truth")
 RIVAL_DISTURBANCES = ("nominal", "slip")
 RIVAL_HEAD = "| controller | limiter |"
+ESTIMATORS = ("ekf", "ekf-slip", "ekf-gyro-smoothed", "truth")
 DISTURBANCES = ("nominal", "slip", "slip-ramps", "ice")
 
 
@@ -117,6 +118,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=8)
     parser.add_argument("--rivals", nargs="*", metavar="LAW")
+    parser.add_argument("--only", choices=ESTIMATORS)
     options = parser.parse_args()
     if options.rivals is not None:
         first = CHOOSING_SEEDS[0]
@@ -124,7 +126,7 @@ def main() -> None:
         put(DOCS / "systems.md", made, "rivals")
         return
     seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + options.seeds)
-    for estimator in ESTIMATOR_KINDS:
+    for estimator in (options.only,) if options.only else ESTIMATORS:
         print(estimator, flush=True)
         put(DOCS / "systems.md", crossed(estimator, seeds), estimator)
 
