@@ -16,6 +16,7 @@ import typer
 from typer.exceptions import TyperException
 
 from baselines.console import (
+    given,
     listed,
     notes,
     print_on_any_terminal,
@@ -391,14 +392,14 @@ def bench(
     ] = False,
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
-    if envelope:
-        from baselines.envelope_command import bench_envelope
-
-        bench_envelope(ctx)
-        return
     names = listed(policies)
     if entry:
         names = (*(names if given(ctx, "policies") else ()), *(f"entry:{one}" for one in entry))
+    if envelope:
+        from baselines.envelope_command import bench_envelope
+
+        bench_envelope(ctx, names)
+        return
     if test or test_seed is not None:
         refuse_beside_test(ctx)
         bench_test(
@@ -454,12 +455,6 @@ def bench(
     else:
         screen.print(board_table(board))
         screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
-
-
-def given(ctx: typer.Context, option: str) -> bool:
-    """Whether an option has another source than its default: the command line or a plan."""
-    source = ctx.get_parameter_source(option)
-    return source is not None and source.name in ("COMMANDLINE", "DEFAULT_MAP")
 
 
 def refuse_beside_test(ctx: typer.Context) -> None:

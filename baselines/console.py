@@ -11,6 +11,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
@@ -115,6 +116,12 @@ def listed(text: str) -> tuple[str, ...]:
     if not names or len(set(names)) < len(names):
         raise ValueError(f"{text!r} must be comma-separated names, each once")
     return names
+
+
+def given(ctx: typer.Context, option: str) -> bool:
+    """Whether an option has another source than its default: the command line or a plan."""
+    source = ctx.get_parameter_source(option)
+    return source is not None and source.name in ("COMMANDLINE", "DEFAULT_MAP")
 
 
 def writable_folder(folder: Path) -> Path:

@@ -24,6 +24,7 @@ from baselines.benchmark.envelope_runs import LEVELS_FILE, run_envelope
 from baselines.benchmark.page import policy_label
 from baselines.benchmark.plan import parse_seeds
 from baselines.console import (
+    given,
     listed,
     progress_bar,
     screen,
@@ -38,8 +39,8 @@ OUT = Path("results/envelope")
 OTHERS = ("disturbances", "level", "sweep")  # options that an envelope has no use for
 
 
-def bench_envelope(ctx: typer.Context) -> None:
-    """Search the envelopes that the options of ``tlf bench`` ask for, write them and print them.
+def bench_envelope(ctx: typer.Context, policies: tuple[str, ...]) -> None:
+    """Search the envelopes of policies as the options of ``tlf bench`` ask for, write them and print them.
 
     Raises
     ------
@@ -47,18 +48,22 @@ def bench_envelope(ctx: typer.Context) -> None:
         for an option that does not go with ``--envelope``, an unknown name, or a plan that cannot run.
     """
     options = ctx.params
+    if options["test"] or options["test_seed"] is not None:
+        raise ValueError(
+            "--test cannot be used with --envelope: every case has its own disturbance"
+        )
     for name in OTHERS:
-        if _given(ctx, name):
+        if given(ctx, name):
             raise ValueError(
                 f"--{name} {options[name]} does not go with --envelope, whose disturbances are --knobs"
             )
     if options["plant"] not in (None, "batch"):
         raise ValueError(f"--plant {options['plant']}: --envelope runs on the plant batch")
     plan = EnvelopePlan(
-        policies=listed(options["policies"]),
-        tasks=listed(options["tasks"]) if _given(ctx, "tasks") else (TASK,),
+        policies=policies,
+        tasks=listed(options["tasks"]) if given(ctx, "tasks") else (TASK,),
         knobs=tuple(knob_presets()) if options["knobs"] == "all" else listed(options["knobs"]),
-        seeds=parse_seeds(options["seeds"] if _given(ctx, "seeds") else SEEDS),
+        seeds=parse_seeds(options["seeds"] if given(ctx, "seeds") else SEEDS),
         resolution=options["resolution"],
         horizon_s=options["horizon_s"],
         trust=options["trust"],
@@ -66,7 +71,7 @@ def bench_envelope(ctx: typer.Context) -> None:
     warn_of_scenarios(
         (f"{task}, {knob}", plan.ends(task, knob)[0]) for task in plan.tasks for knob in plan.knobs
     )
-    folder: Path = options["out"] if _given(ctx, "out") else OUT
+    folder: Path = options["out"] or OUT
     warn_of_compiling()
     with progress_bar("envelope") as update:
         results = run_envelope(
@@ -84,12 +89,6 @@ def bench_envelope(ctx: typer.Context) -> None:
     screen.print(_score_table(board))
     screen.print(_level_table(board))
     screen.print(f"In {folder}: {LEVELS_FILE}, {PAGE_FILE}, {BOARD_FILE}", soft_wrap=True)
-
-
-def _given(ctx: typer.Context, name: str) -> bool:
-    """Whether an option is set, on the command line or by a plan."""
-    source = ctx.get_parameter_source(name)
-    return source is not None and source.name != "DEFAULT"
 
 
 def _draw(board: dict[str, Any], folder: Path) -> list[Path]:

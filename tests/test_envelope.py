@@ -324,6 +324,8 @@ def test_the_figure_is_drawn(tmp_path, monkeypatch):
     [
         ("--sweep level=0:1:3", "--sweep level=0:1:3 does not go with --envelope"),
         ("--disturbances ice", "--disturbances ice does not go with"),
+        ("--test", "--test cannot be used with --envelope"),
+        ("--entry no_such_folder --knobs friction", "no_such_folder"),
         ("--plant pymunk", "--plant pymunk: --envelope runs on the plant batch"),
         ("--knobs no_such", "knob 'no_such' is not one of calibration"),
         ("--knobs friction --resolution 0", "resolution 0 must be 0.001 to 1"),

@@ -137,13 +137,13 @@ def sign_interval(ordered: Sequence[float]) -> list[float] | None:
 
 def text_of(cell: Mapping[str, Any]) -> str:
     """The envelope as the shown number with its interval."""
+    mark = " ↕" if cell["holds_again"] else ""
     if cell["level"] is None:
-        return f"none ({short(cell['value_first'])} fails)"
+        return f"none ({short(cell['value_first'])} fails){mark}"
     if cell["beyond"]:
         return f"all (to {short(cell['value_last'])})"
     low = "–" if cell["value_low"] is None else short(cell["value_low"])
     high = "–" if cell["value_high"] is None else short(cell["value_high"])
-    mark = " ↕" if cell["holds_again"] else ""
     return f"{short(cell['value'])} [{low}, {high}]{mark}"
 
 

@@ -250,13 +250,15 @@ def envelopes(options: argparse.Namespace) -> None:
     board = envelope_board(results)
     score, *levels = "\n".join(envelope_tables(board)).split("\n\n", 1)
     hours = board["processor_hours"]
+    missing = [f"`{name}`" for name in knob_presets() if name not in options.knobs]
     put(DOCS / "envelopes.md", score, "score")
     put(DOCS / "envelopes.md", f"{explanation(board)}\n\n{levels[0]}", "levels")
     put(
         DOCS / "envelopes.md",
         f"The {board['levels']} levels of the table, with up to {options.seeds} runs of {HORIZON_S:g} s each, "
         f"took {hours:.2f} hours of one processor core. With 100 seeds it is about "
-        f"{100 / options.seeds * hours:.1f} hours.",
+        f"{100 / options.seeds * hours:.1f} hours."
+        + (f" Knobs not in the table and the score: {', '.join(missing)}." if missing else ""),
         "time",
     )
     write(draw_envelopes(board), "envelope")
