@@ -536,6 +536,19 @@ def test_a_system_of_the_papers_law_is_a_controller():
     assert alone.start.parameters["k_theta_per_mm"] == pytest.approx(0.016)
 
 
+def test_a_start_names_its_estimator_whatever_the_search_that_it_is_like(tmp_path):
+    path = tmp_path / "mine.yaml"
+    own = {"start": "kanayama:bounded+ekf-gyro-smoothed+body", "horizon_s": 30}
+    ranges = {"law.k_x_per_s": {"low": 1, "high": 5}}
+    path.write_text(yaml.safe_dump({"like": "tuned", "search": ranges, **own}))
+    settings = load_tune(path)
+    named = fit_policy(own["start"], load_scenario()).scenario
+    for scenario in settings.scenarios(None).values():
+        assert scenario.estimator == settings.estimator == "ekf-gyro"
+        assert scenario.broadcast_smoothing_s == named.broadcast_smoothing_s > 0
+    assert search.use_of(settings) == "kanayama:FILE+ekf-gyro-smoothed+body"
+
+
 @pytest.mark.parametrize("name", LAWS)
 def test_every_law_has_a_search_with_the_tasks_and_the_budget_of_all(name):
     if name == "nmpc":
@@ -551,6 +564,10 @@ def test_every_law_has_a_search_with_the_tasks_and_the_budget_of_all(name):
     ("change", "said"),
     [
         ({"start": "feedback+ekf-slip+body"}, "controller 'feedback'"),
+        (
+            {"start": "reference:tuned+ekf-slip-smoothed", "search": SMALL["search"]},
+            "a controller is searched without smoothed broadcasts",
+        ),
         ({"start": "kanayama:no_such"}, "kanayama 'no_such' is not one of bounded"),
         ({"start": "kanayama+ekf-slip+bodi"}, "limiter 'bodi' is not one of body"),
         ({"estimator": "ekf"}, "names the estimator 'ekf-slip'; estimator is 'ekf'"),

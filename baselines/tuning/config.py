@@ -16,7 +16,7 @@ from pydantic import (
 
 from baselines.policies.laws.catalogue import LAWS
 from baselines.policies.reference import ReferencePolicy
-from baselines.policies.systems import Limiter
+from baselines.policies.systems import Limiter, parse_system
 from baselines.runs.nested import value_at, with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from baselines.runs.splits import check_training
@@ -286,11 +286,10 @@ class TuneConfig(Frozen):
                 scenario = load_scenario(
                     task,
                     disturbance=disturbance,
-                    estimator=self.estimator,
                     ekf_slip=None if ekf_slip is None else ekf_slip.model_dump(),
                     horizon_s=self.horizon_s,
                     plant="batch",
-                    **asked,
+                    **{"estimator": self.estimator, **asked},
                 )
                 if (scenario.action, scenario.observation) != ("twist", "tracking"):
                     raise ValueError(
@@ -331,7 +330,11 @@ def _read(source: str, before: tuple[str, ...]) -> dict[str, Any]:
     if not isinstance(other, str):
         raise ValueError(f"like must be the name of a search or a .yaml file, got {other!r}")
     other = beside(folder, other) if is_file_name(source) else other
-    return _read(other, (*before, source)) | found
+    others = _read(other, (*before, source))
+    start = found.get("start")
+    if isinstance(start, str) and parse_system(start) is not None:
+        others.pop("estimator", None)  # the system names its own
+    return others | found
 
 
 def load_tune(source: str | Path, *, trials: int | None = None) -> TuneConfig:

@@ -77,7 +77,7 @@ def use_of(config: TuneConfig, folder: Path | None = None) -> str:
     if not isinstance(config.start, LawStart):
         return f"reference:{path}"
     limiter = limiter_path if _limiter_is_searched(config) else config.start.limiter or "none"
-    return f"{config.start.law}:{path}+{config.estimator}+{limiter}"
+    return f"{config.start.law}:{path}+{config.start.estimator or config.estimator}+{limiter}"
 
 
 def _limiter_is_searched(config: TuneConfig) -> bool:

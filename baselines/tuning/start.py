@@ -10,6 +10,7 @@ from pydantic import ValidationError, model_validator
 from baselines.policies.laws.catalogue import LAWS, law_of, read_law
 from baselines.policies.laws.law import LawFile
 from baselines.policies.systems import (
+    ESTIMATORS,
     LimitedLaw,
     Limiter,
     SystemName,
@@ -30,11 +31,14 @@ class LawStart(Limiter):
     law: str
     parameters: dict[str, Any]  # of the law's file, with its defaults
     limiter: str | None = None  # name of the limits that it starts with, None: none
+    estimator: str | None = None  # as systems name it, if the start is one
 
     @model_validator(mode="after")
     def _check(self) -> Self:
         if self.law not in LAWS:
             raise ValueError(f"law {self.law!r} is not one of {', '.join(LAWS)}")
+        if self.estimator is not None and self.estimator not in ESTIMATORS:
+            raise ValueError(f"estimator {self.estimator!r} is not one of {', '.join(ESTIMATORS)}")
         law_file(self.law, self.parameters)
         return self
 
@@ -50,8 +54,9 @@ class LawStart(Limiter):
 
     @property
     def scenario_overrides(self) -> dict[str, Any]:
-        """The scenario's fields that the law asks for."""
-        return dict(LAWS[self.law][0].scenario_overrides)
+        """The scenario's fields that the law and a named estimator ask for."""
+        estimator = ESTIMATORS[self.estimator] if self.estimator is not None else {}
+        return {**LAWS[self.law][0].scenario_overrides, **estimator}
 
     def with_numbers(self, parameters: dict[str, Any], limiter: dict[str, Any]) -> LawStart:
         """The same law with other parameters and another limiter.
@@ -61,7 +66,7 @@ class LawStart(Limiter):
         ValueError
             for an invalid value.
         """
-        kept = {"law": self.law, "limiter": self.limiter}
+        kept = {"law": self.law, "limiter": self.limiter, "estimator": self.estimator}
         return LawStart.model_validate({**kept, "parameters": parameters, **limiter})
 
     def policy(self, scenario: Scenario) -> Policy:
@@ -113,15 +118,19 @@ def named_start(name: str) -> Named:
     system = parse_system(name) or SystemName(name, "", None)
     head, _, tail = system.controller.partition(":")
     limiter = None if system.limiter is None else load_limiter(system.limiter)
-    estimator = system.estimator or None
+    named = system.estimator or None
+    estimator = None if named is None else str(ESTIMATORS[named]["estimator"])
     if head in LAWS:
         given = read_law(head, tail).model_dump(exclude={"found"})
         given |= {key: _default(head, key) for key, value in given.items() if value is None}
         limits = {} if limiter is None else limiter.model_dump()
-        return Named(
-            LawStart(law=head, parameters=given, limiter=system.limiter, **limits), estimator
+        made = LawStart(
+            law=head, parameters=given, limiter=system.limiter, estimator=named, **limits
         )
+        return Named(made, estimator)
     if estimator is None:
         return Named(controller(name), None)
+    if named != estimator:
+        raise ValueError(f"start {name!r}: a controller is searched without smoothed broadcasts")
     known = controller(tail or "consistent") if head == "reference" else controller(head)
     return Named(behind(known, limiter or own_limiter(known)), estimator)
