@@ -26,7 +26,12 @@ from baselines.benchmark.envelope import (
     most_left,
     untested,
 )
-from baselines.benchmark.envelope_board import envelope_board, sign_interval, write_envelope
+from baselines.benchmark.envelope_board import (
+    envelope_board,
+    sign_interval,
+    text_of,
+    write_envelope,
+)
 from baselines.benchmark.envelope_runs import EnvelopeResults, run_envelope, run_probe
 from baselines.cli import main
 from baselines.policies.registry import fit_policy
@@ -280,6 +285,9 @@ def test_the_score_is_the_geometric_mean_of_the_levels(tmp_path, monkeypatch):
     assert row["ratio"] == pytest.approx(0.6 / 1.5, rel=0.05)
     assert (row["smaller"], row["larger"], row["interval"]) == (2, 0, None)
     assert board["processor_hours"] == pytest.approx(len(results.lines) / 100)
+    assert (
+        text_of(board["cells"][0] | {"level": None, "holds_again": [1.0]}) == "none (0.9 fails) ↕"
+    )
     assert "| `friction` | `tyre.friction_scale` | 0.5 |" in (tmp_path / "envelope.md").read_text()
 
 
