@@ -7,6 +7,7 @@ and needs no extra.
 
 from __future__ import annotations
 
+from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
 from typing import Any
 
@@ -38,25 +39,45 @@ FILTERS: dict[str, dict[str, Any]] = {
     "none of the three": {"ekf_slip": {**WITHOUT_LEARNING, **WITHOUT_SURPRISE, **WITHOUT_WHEELS}},
     "true pose and slip": {"estimator": "truth"},
 }
+PAPER = controller("consistent").gains
 LAWS: dict[str, dict[str, Any]] = {
     "`tuned`": {},
+    "$k_1$ = 0.23 1/s, the paper's": {"gains": {"k_1_per_s": PAPER.k_1_per_s}},
+    "$k_2/k_3$ = 0.83 1/s, the paper's": {
+        "gains": {"k_2_mm2_s": PAPER.k_2_mm2_s / PAPER.k_3_mm2 * TUNED.gains.k_3_mm2}
+    },
+    "$k_3$ = 12 000 mm², the paper's": {
+        "gains": {
+            "k_2_mm2_s": TUNED.gains.k_2_mm2_s / TUNED.gains.k_3_mm2 * PAPER.k_3_mm2,
+            "k_3_mm2": PAPER.k_3_mm2,
+        }
+    },
     "no $w$": {"limits": {"braking_error_mm": None}},
+    "no $E_1$": {"limits": {"forward_error_mm": None}},
+    "no $E_2$": {"limits": {"lateral_error_mm": None}},
     "$F$ = 0": {"limits": {"free_speed_mm_s": 0.0}},
     "$R$ = 100 mm": {"limits": {"free_reach_mm": 100.0}},
     "no $\\Omega$": {"limits": {"yaw_rate_rad_s": None}},
     "no $A_1$, $A_3$": {"limits": {"acceleration_mm_s2": None, "turning_acceleration_mm_s2": None}},
+    "no $A_2$": {"limits": {"yaw_acceleration_rad_s2": None}},
     "$A_\\perp$ = 230 mm/s²": {"limits": {"lateral_acceleration_mm_s2": 230.0}},
+    "no $V$": {"limits": {"reverse_mm_s": None}},
+    "slip not subtracted": {"limits": {"cancel_slip": False}},
+    "no distance to the predecessor": {"spacing": None},
+    "no lead": {"lead_s": 0.0},
     "$\\eta$ = 0.4, $\\epsilon$ = 1000": {"gains": {"eta": 0.4, "epsilon": 1000.0}},
 }
 
 
-def changed(change: dict[str, dict[str, Any]]) -> ReferencePolicy:
-    """`tuned` with some numbers of its gains or limits changed."""
+def changed(change: dict[str, Any]) -> ReferencePolicy:
+    """`tuned` with some numbers of its gains or limits, its spacing or its lead changed."""
     return ReferencePolicy(
         TUNED.model_copy(
             update={
-                part: getattr(TUNED, part).model_copy(update=numbers)
-                for part, numbers in change.items()
+                part: getattr(TUNED, part).model_copy(update=value)
+                if isinstance(value, dict)
+                else value
+                for part, value in change.items()
             }
         )
     )
@@ -78,10 +99,14 @@ def table(rows: dict[str, tuple[ReferencePolicy, dict[str, Any]]]) -> str:
     """A row for each variant, a column for each disturbance."""
     lines = ["| | " + " | ".join(f"`{name}`" for name in DISTURBANCES) + " |"]
     lines.append("|---" + "|---:" * len(DISTURBANCES) + "|")
-    for name, (policy, fields) in rows.items():
-        cells = [cell(policy, disturbance, fields) for disturbance in DISTURBANCES]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
-        print(lines[-1], flush=True)
+    with ProcessPoolExecutor() as pool:
+        found = {
+            name: [pool.submit(cell, policy, disturbance, fields) for disturbance in DISTURBANCES]
+            for name, (policy, fields) in rows.items()
+        }
+        for name, cells in found.items():
+            lines.append(f"| {name} | " + " | ".join(one.result() for one in cells) + " |")
+            print(lines[-1], flush=True)
     return "\n".join(lines)
 
 
