@@ -1,12 +1,14 @@
 """What each part of the filter with gyro and torques is worth, under slip of many shapes.
 
-Writes the table of ``docs/controller/gyro-estimator.md``. ``python docs/figures/make_gyro.py`` drives 16
-seeds of each cell for 60 s on the batch plant, on all cores; it needs no extra. ``--seeds N`` drives others.
+Writes the tables of ``docs/controller/gyro-estimator.md``. ``python docs/figures/make_gyro.py`` drives 16
+seeds of each cell for 60 s on the batch plant, on all cores; it needs no extra. ``--seeds N`` drives others,
+``--only NAME`` makes one table.
 """
 
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Iterable
 from concurrent.futures import ProcessPoolExecutor
 from typing import Any
 
@@ -74,27 +76,70 @@ COLUMNS: dict[str, dict[str, Any]] = {
 }
 
 
+# Sensors, motors, robots and floors, on the systems of these estimators.
+OTHERS = ("ekf-slip", "ekf-gyro-smoothed", "truth")
+SLOW_START = {"start_ramp_s": 6.0}
+CONDITIONS: dict[str, dict[str, Any]] = {
+    "encoders of 4096 counts, with velocity observer": {
+        "disturbance": "encoders-4096",
+        "wheel_loop": {"speed_observer_rad_s": 80.0},
+    },
+    "fixes at 100 Hz": {"disturbance": "fixes-100hz"},
+    "sensors and motors of `infinity_hardware`": {"source": "infinity_hardware"},
+    "five robots": {"robots": 5},
+    "ten robots on `long_circle`": {"source": "long_circle", "robots": 10},
+    "friction × 0.5, start within 6 s": {"disturbance": "ice", **SLOW_START},
+    "friction × 0.45": {"disturbance": {"tyre": {"friction_scale": 0.45}}, **SLOW_START},
+    "friction × 0.4": {"disturbance": {"tyre": {"friction_scale": 0.4}}, **SLOW_START},
+    "friction × 0.35": {"disturbance": {"tyre": {"friction_scale": 0.35}}, **SLOW_START},
+    "`patches` (× 0.4), start within 6 s": {"disturbance": "patches", **SLOW_START},
+}
+
+
 def one(row: str, column: str, seeds: range) -> str:
-    """A cell of the table."""
+    """A cell of the table of slip."""
     estimator, fields = ROWS[row]
     disturbance = {"slip": COLUMNS[column], "gyro": GYRO}
     return cell((f"{LAW}+{estimator}+body", {}), {"disturbance": disturbance, **fields}, seeds)
+
+
+def other(estimator: str, condition: str, seeds: range) -> str:
+    """A cell of the table of other conditions."""
+    return cell((f"{LAW}+{estimator}+body", {}), CONDITIONS[condition], seeds)
+
+
+def table(
+    head: str, rows: Iterable[str], columns: Iterable[str], made: Callable[..., str], seeds: range
+) -> str:
+    """A row for each condition, a column for each estimator."""
+    estimators = list(columns)
+    lines = [
+        f"| {head} | " + " | ".join(estimators) + " |",
+        "|---" + "|---:" * len(estimators) + "|",
+    ]
+    with ProcessPoolExecutor() as pool:
+        found = {
+            row: [pool.submit(made, estimator, row, seeds) for estimator in estimators]
+            for row in rows
+        }
+        for row, cells in found.items():
+            lines.append(f"| {row} | " + " | ".join(each.result() for each in cells) + " |")
+            print(lines[-1], flush=True)
+    return "\n".join(lines)
 
 
 def main() -> None:
     """Drive and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=16)
-    seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + parser.parse_args().seeds)
-    lines = ["| slip | " + " | ".join(ROWS) + " |", "|---" + "|---:" * len(ROWS) + "|"]
-    with ProcessPoolExecutor() as pool:
-        found = {
-            column: [pool.submit(one, row, column, seeds) for row in ROWS] for column in COLUMNS
-        }
-        for column, cells in found.items():
-            lines.append(f"| {column} | " + " | ".join(each.result() for each in cells) + " |")
-            print(lines[-1], flush=True)
-    put(DOCS / "controller" / "gyro-estimator.md", "\n".join(lines), "shapes")
+    parser.add_argument("--only", choices=("shapes", "conditions"))
+    options = parser.parse_args()
+    seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + options.seeds)
+    page = DOCS / "controller" / "gyro-estimator.md"
+    if options.only != "conditions":
+        put(page, table("slip", COLUMNS, ROWS, one, seeds), "shapes")
+    if options.only != "shapes":
+        put(page, table("", CONDITIONS, OTHERS, other, seeds), "conditions")
 
 
 if __name__ == "__main__":

@@ -112,7 +112,8 @@ TABLES: dict[str, dict[str, dict[str, Any]]] = {
 def cell(entry: tuple[str, dict[str, Any]], fields: dict[str, Any], seeds: range) -> str:
     """The worst robot's position RMS (mm), median over seeds, and how many runs failed."""
     name, own = entry
-    scenario = load_scenario("infinity", **{"horizon_s": HORIZON_S, "plant": "batch"} | fields)
+    fields = {"source": "infinity", "horizon_s": HORIZON_S, "plant": "batch"} | fields
+    scenario = load_scenario(**fields)
     fitted = fit_policy(name, scenario)
     driven = load_scenario(fitted.scenario, **own)
     runs = [record.metrics() for record in run_seeds(driven, fitted.policy, seeds, name=name)]
