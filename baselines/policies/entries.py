@@ -15,6 +15,7 @@ from baselines.policies.systems import ENTRY
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen
 from tlf_env.common.presets import read_yaml
+from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
@@ -34,6 +35,8 @@ class AskedFields(Frozen):
     observation: Literal["tracking", "sensor"] | None = None
     estimator: str | None = None
     ekf_slip: SlipEkfParameters | None = None
+    ekf_gyro: GyroEkfParameters | None = None
+    broadcast_smoothing_s: float | None = None
     residual_base: str | None = None
     residual_fade_mm: float | None = None
     residual_reach_mm: float | None = None
