@@ -261,6 +261,9 @@ def test_the_files_of_a_system_count_as_its_source(tmp_path):
 def test_a_table_has_the_systems_name_and_no_second_estimator():
     line = {"overrides": {"estimator": "ekf-slip"}, "privileged": False}
     assert policy_label({"policy": "kanayama+ekf-slip+body"} | line) == "kanayama+ekf-slip+body"
+    smoothed = {"overrides": {"estimator": "ekf-gyro", "broadcast_smoothing_s": 0.1}}
+    name = "kanayama+ekf-gyro-smoothed+body"
+    assert policy_label({"policy": name} | line | smoothed) == name
     assert policy_label({"policy": "reference:tuned"} | line) == (
         "reference:tuned (estimator ekf-slip)"
     )

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from baselines.policies.registry import describe_overrides
-from baselines.policies.systems import parse_system
+from baselines.policies.systems import ESTIMATORS, parse_system
 
 MOST_LATE = 0.01  # share of late steps of an entry in real time
 # How `comparisons` are made; a leaderboard.json without the key `compared_by` has the second.
@@ -180,9 +180,10 @@ def task_tables(board: dict[str, Any], task: str) -> list[str]:
 def policy_label(row: dict[str, Any]) -> str:
     """A policy's name and the scenario fields that it sets; marked if privileged (uses the true state).
 
-    The estimator of a system is in its name.
+    What the estimator of a system sets is in its name.
     """
-    named = ("estimator",) if parse_system(row["policy"]) else ()
+    system = parse_system(row["policy"])
+    named = () if system is None else tuple(ESTIMATORS[system.estimator])
     overrides = row.get("overrides", {})
     marks = describe_overrides({key: overrides[key] for key in overrides if key not in named})
     marks += ["privileged"] if row["privileged"] else []
