@@ -6,13 +6,12 @@ import numpy as np
 import pytest
 
 from baselines.policies.laws.catalogue import make_law
+from baselines.policies.laws.predictive import NODE, PREVIEW_S, Predictive
 from baselines.policies.registry import fit_policy, make_policy
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
 
 casadi = pytest.importorskip("casadi")
-
-from baselines.policies.laws.predictive import NODE, PREVIEW_S, Predictive  # noqa: E402
 
 AT_REST = np.zeros((len(PREVIEW_S), 2))
 
