@@ -149,5 +149,5 @@ def whole_episode_digest(scenario: str, seed: int, **overrides: Any) -> str:
 def installed(policies):
     """Names of policies for a parametrised test, which skips those whose package is missing."""
     missing = importlib.util.find_spec("casadi") is None
-    skip = pytest.mark.skipif(missing, reason="casadi is not installed")
+    skip = pytest.mark.skipif(missing, reason="nmpc needs casadi, of the optional extra mpc")
     return [pytest.param(name, marks=skip if name.startswith("nmpc") else ()) for name in policies]

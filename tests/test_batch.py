@@ -364,7 +364,7 @@ def test_bad_seeds_and_masks_are_named():
             plant.reset(0, mask)
 
 
-def test_a_start_that_cannot_be_is_told_with_its_formation():
+def test_a_start_that_cannot_be_is_reported_with_its_formation():
     plant = BatchPlant("infinity", 2, disturbance={"payload": {"mass_kg": 2.0, "behind_mm": 200.0}})
     with pytest.raises(ValueError, match=r"formation 0: payload of 2 kg"):
         plant.reset(0)

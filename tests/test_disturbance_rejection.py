@@ -29,7 +29,7 @@ def moved(pose, twist):
     return pose + np.array(step)
 
 
-def driven(law, slip=(0.0, 0.0), steps=400, start=(0.0, 0.0, 0.0), told=(0.0, 0.0)):
+def driven(law, slip=(0.0, 0.0), steps=400, start=(0.0, 0.0, 0.0), estimated=(0.0, 0.0)):
     """Errors ``(step, 3)`` and memories of a robot that slips, and whose wheels follow at once."""
     robot, goal, wheels = np.array(start), np.zeros(3), np.array([300.0, 0.3])
     state, errors, memories = None, [], []
@@ -40,12 +40,12 @@ def driven(law, slip=(0.0, 0.0), steps=400, start=(0.0, 0.0, 0.0), told=(0.0, 0.
         errors.append((e_1, e_2, e_3))
         seen = {"e_1": e_1, "e_2": e_2, "sin_e_3": math.sin(e_3), "cos_e_3": math.cos(e_3)}
         for i in (1, 2):
-            seen |= {f"reference_u_{i}": (300.0, 0.3)[i - 1], f"slip_{i}": told[i - 1]}
+            seen |= {f"reference_u_{i}": (300.0, 0.3)[i - 1], f"slip_{i}": estimated[i - 1]}
             seen |= {f"odometry_u_{i}": wheels[i - 1], f"command_u_{i}": wheels[i - 1]}
         row = [seen.get(name, 0.0) / entry.scale for name, entry in ENTRIES.items()]
-        wanted, state = law.wanted(np.array(row), state, slip_cancelled=any(told))
+        wanted, state = law.wanted(np.array(row), state, slip_cancelled=any(estimated))
         memories.append(state[0])
-        wheels = wanted[0] - told
+        wheels = wanted[0] - estimated
         robot, goal = moved(robot, wheels + slip), moved(goal, (300.0, 0.3))
     return np.array(errors), np.array(memories)
 
@@ -85,7 +85,7 @@ def test_without_slip_it_is_feedback_linearisation():
 
 def test_a_slip_that_is_subtracted_behind_the_law_is_not_found_again():
     slip = (50.0, -0.3)
-    errors, memories = driven(DisturbanceRejection(), slip, told=slip)
+    errors, memories = driven(DisturbanceRejection(), slip, estimated=slip)
     assert np.abs(memories[:, [D_1, D_2]]).max() < 0.05
     assert np.abs(errors[-1]).max() < 0.05
 

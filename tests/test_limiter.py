@@ -405,7 +405,7 @@ def test_gains_alone_are_a_controller_without_limits():
     assert controller("consistent") == Controller()
 
 
-def test_an_unknown_name_is_told_with_those_there_are():
+def test_an_unknown_name_is_reported_with_those_there_are():
     with pytest.raises(ValueError, match=r"'bold' is not one of consistent, printed, tuned"):
         controller("bold")
     with pytest.raises(ValueError, match=r"'bold' is not one of consistent, printed, tuned"):

@@ -370,7 +370,7 @@ class TestWaypoints:
             ("t_s,x_mm,y_mm\n0,7,7\n1,7,7\n", "all waypoints are at the same position"),
         ],
     )
-    def test_a_bad_file_is_told_in_one_line(self, tmp_path, text, said):
+    def test_a_bad_file_is_reported_in_one_line(self, tmp_path, text, said):
         path = tmp_path / "bad.csv"
         path.write_text(text, encoding="utf-8")
         assert said in message(read_points, path)

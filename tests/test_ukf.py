@@ -120,7 +120,7 @@ class Drive(NamedTuple):
     parts: list[Any]
 
 
-class Watched(ukf.SlipUkf):  # type: ignore[misc]  # a script's class, known at run time only
+class Watched(ukf.SlipUkf):  # type: ignore[misc]  # loaded from a file at run time
     """Keeps what it returns, and the pose by odometry alone."""
 
     def reset(self, pose: np.ndarray) -> None:

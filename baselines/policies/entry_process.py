@@ -69,7 +69,7 @@ class EntryProcess:
         self._type = np.dtype(hello["dtype"])
         self.step_times_s: list[float] = []
         program = sys.executable if command[0] == "python" else command[0]
-        self._errors = tempfile.TemporaryFile()  # noqa: SIM115  open as long as the process
+        self._errors = tempfile.TemporaryFile()  # noqa: SIM115 - _end closes it, after the process
         try:
             self._process = subprocess.Popen(
                 [program, *command[1:]],

@@ -33,7 +33,7 @@ def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, notes: dict[
     """
     tensors: dict[str, torch.Tensor] = {"torch_generator": torch.get_rng_state()}
     # SB3 shuffles its samples with NumPy's global generator, so a resumed training needs its state.
-    kind, keys, place, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 uses this one
+    kind, keys, place, has_gauss, gauss = np.random.get_state()  # noqa: NPY002 - SB3 draws from it
     tensors["numpy_generator"] = torch.from_numpy(np.asarray(keys).copy())
     plain = {
         "notes": notes,
@@ -74,7 +74,7 @@ def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, 
             plant._seeded[:] = True
         kind, *rest = plain["numpy_generator"]
         keys = tensors["numpy_generator"].numpy()
-        np.random.set_state((kind, keys, *rest))  # noqa: NPY002 - SB3 uses this one
+        np.random.set_state((kind, keys, *rest))  # noqa: NPY002 - SB3 draws from it
         model.action_space.np_random.bit_generator.state = plain["action_generator"]
         torch.set_rng_state(tensors["torch_generator"])
     except (SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as error:

@@ -16,18 +16,18 @@ encoders'. No test for jumps of the wheel speeds is needed.
 
 from __future__ import annotations
 
-import math
-
 from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.rows import replacing
 from tlf_env.onboard.estimator import Estimate
 from tlf_env.onboard.slip_estimator import (
     SlipEkf,
+    SlipEkfParameters,
     SlipEstimate,
     correct_with_slip,
     predict_with_slip,
     sample_weight,
+    slip_ekf_constants,
 )
 from tlf_env.physics.vehicle import Body
 
@@ -57,34 +57,25 @@ class GyroEkfParameters(Frozen):
 def gyro_ekf_constants(parameters: GyroEkfParameters, robot: Body, dt_s: float) -> SlipEkf:
     """Constants of the filter for a sampling period of ``dt_s`` s, and a robot without payload."""
     by_torque = parameters.torque_time_s is not None
-    return SlipEkf(
-        forward=parameters.forward_noise_mm2_s * dt_s,
-        sideways=parameters.sideways_noise_mm2_s * dt_s,
-        heading=parameters.heading_noise_rad2_s * dt_s,
-        walk_1=parameters.speed_walk_mm2_s3 * dt_s,
-        walk_2=parameters.gyro_walk_rad2_s3 * dt_s,
-        variance=parameters.fix_variance_mm2,
-        bound_1=parameters.speed_error_bound_mm_s,
-        bound_2=parameters.gyro_error_bound_rad_s,
-        variance_weight=0.0
-        if parameters.fix_variance_time_s is None
-        else sample_weight(dt_s, parameters.fix_variance_time_s),
-        least_variance=parameters.least_fix_variance_mm2,
-        variance_factor=parameters.fix_variance_factor,
-        # No surprise and no jumps.
-        mean_weight=1.0,
-        threshold=math.inf,
+    # The slip filter's constants for the errors in place of the slips, without surprise and jumps.
+    shared = SlipEkfParameters(
+        forward_noise_mm2_s=parameters.forward_noise_mm2_s,
+        sideways_noise_mm2_s=parameters.sideways_noise_mm2_s,
+        heading_noise_rad2_s=parameters.heading_noise_rad2_s,
+        delta_1_walk_mm2_s3=parameters.speed_walk_mm2_s3,
+        delta_2_walk_rad2_s3=parameters.gyro_walk_rad2_s3,
+        fix_variance_mm2=parameters.fix_variance_mm2,
+        fix_variance_time_s=parameters.fix_variance_time_s,
+        least_fix_variance_mm2=parameters.least_fix_variance_mm2,
+        fix_variance_factor=parameters.fix_variance_factor,
+        delta_1_bound_mm_s=parameters.speed_error_bound_mm_s,
+        delta_2_bound_rad_s=parameters.gyro_error_bound_rad_s,
+        surprise_threshold=None,
         most_surprise=0.0,
-        surprise_speed=1.0,
-        surprise_heading=0.0,
-        surprise_1=0.0,
-        surprise_2=0.0,
-        change_1=math.inf,
-        change_2=math.inf,
-        grip_1=0.0,
-        grip_2=0.0,
-        jump_variance=0.0,
-        roughness_weight=0.0,
+        most_acceleration_mm_s2=None,
+        most_yaw_acceleration_rad_s2=None,
+    )
+    return slip_ekf_constants(shared, dt_s)._replace(
         slip_weight=sample_weight(dt_s, parameters.slip_time_s),
         reported_1=parameters.delta_1_bound_mm_s,
         reported_2=parameters.delta_2_bound_rad_s,
