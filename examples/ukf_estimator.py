@@ -1,8 +1,8 @@
 """An unscented Kalman filter as a robot's estimator: pose, slip and gyro bias, driven under continuous slip.
 
-It shows how an estimator of one's own is made from the filter in ``baselines.policies.estimators.unscented``; the
-estimator ``ukf`` there has a fuller model. It uses encoders, position fixes with their times, and the gyro, and
-returns pose, twist, slip and covariance; controllers cancel the slip, and the follower receives the twist.
+It shows how an estimator of one's own is made from the filter in ``baselines.policies.estimators.unscented``;
+the estimator ``ukf`` there has a fuller model. It uses encoders, position fixes with their times, and the gyro,
+and returns pose, twist, slip and covariance; controllers cancel the slip, and the follower receives the twist.
 It is compared with the built-in filters on the same random draws, with a fix every 1 ms and every 10 ms.
 
     python examples/ukf_estimator.py --disturbance slip-ramps

@@ -163,7 +163,7 @@ class MovingHorizonEstimator(Reckoning):
         for name, value in (("huber", huber), ("slip_bound_mm_s", slip_bound_mm_s)):
             if not value > 0.0:
                 raise ValueError(f"{name} {value} must be positive")
-        self._links = round(window_s / (self._every * period_s))
+        self._links = max(round(window_s / (self._every * period_s)), 1)
         self._huber, self._slip_bound = huber, slip_bound_mm_s
 
     def reset(self, pose: np.ndarray) -> None:
@@ -218,12 +218,9 @@ class MovingHorizonEstimator(Reckoning):
         gradient = np.zeros((nodes, STATES))
         mean, information[0] = self._arrival
         gradient[0] = information[0] @ (z[0] - mean)
-        # Encoders
-        off = rolling_speed(z[1:], pasts) - pasts.rolled / pasts.time_s
-        row = rolling_slope(self._pasts[0])
-        weight = (self._pasts[0].time_s / noise.rolled_mm) ** 2
-        information[1:] += weight * np.outer(row, row)
-        gradient[1:] += weight * off[:, None] * row
+        rolling, slope = self._rolling_terms(z[1:], pasts)
+        information[1:] += rolling
+        gradient[1:] += slope
         # Fixes
         missed = z[:, None, :2] - self._measured[:nodes]
         sizes = np.hypot(missed[..., 0], missed[..., 1]) / np.sqrt(self.fix_variance)
@@ -239,6 +236,13 @@ class MovingHorizonEstimator(Reckoning):
             miss=z[1:] - moved(before, pasts, noise),
         )
         return information, gradient, links
+
+    def _rolling_terms(self, z: np.ndarray, pasts: Interval) -> tuple[np.ndarray, np.ndarray]:
+        """Information ``(8, 8)`` of what was rolled before each node, and its gradients ``(node, 8)``."""
+        off = rolling_speed(z, pasts) - pasts.rolled / pasts.time_s
+        row = rolling_slope(self._pasts[0])
+        weight = (self._pasts[0].time_s / self.noise.rolled_mm) ** 2
+        return weight * np.outer(row, row), weight * off[:, None] * row
 
     def _step(
         self, information: np.ndarray, gradient: np.ndarray, links: Links
@@ -261,11 +265,14 @@ class MovingHorizonEstimator(Reckoning):
         return change, covariance
 
     def _drop(self) -> None:
-        """Eliminate the oldest node."""
+        """Eliminate the oldest node, with its link and what was rolled after it."""
         information, gradient, links = self._terms(2)
         link = Links(*(part[0] for part in links))
         left, slope = eliminated(information[0], gradient[0], link)
-        left = 0.5 * (left + left.T)
+        past = Interval(*np.array([self._pasts[0]]).T)
+        rolling, rolling_slopes = self._rolling_terms(self._states[1:2], past)
+        left = 0.5 * (left + left.T) + rolling
+        slope = slope + rolling_slopes[0]
         del self._pasts[0], self._ways_at[0]
         self._states = self._states[1:]
         self._measured[:-1], self._here[:-1] = self._measured[1:].copy(), self._here[1:].copy()

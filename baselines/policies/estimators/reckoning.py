@@ -50,12 +50,12 @@ class Noise(Frozen):
     """Sizes of noise and errors, and bounds of what is reported."""
 
     # White noise: standard deviation after 1 s
-    forward_mm: NonNegative = 0.5
-    sideways_mm: NonNegative = 0.3
-    heading_rad: NonNegative = 3.0e-4
-    speed_mm_s: NonNegative = 5.0
-    scale: NonNegative = 1.0e-3
-    bias_rad_s: NonNegative = 1.0e-4
+    forward_mm: Positive = 0.5
+    sideways_mm: Positive = 0.3
+    heading_rad: Positive = 3.0e-4
+    speed_mm_s: Positive = 5.0
+    scale: Positive = 1.0e-3
+    bias_rad_s: Positive = 1.0e-4
     # Gauss–Markov processes: standard deviation and correlation time
     slip_mm_s: Positive = 30.0
     slip_time_s: Positive = 1.0
@@ -67,7 +67,7 @@ class Noise(Frozen):
     # Sensors
     rolled_mm: Positive = 0.04  # of what the encoders rolled in an interval
     fix_variance_mm2: Positive = 0.2  # of each coordinate, at the start
-    fix_variance_time_s: Positive = 0.5  # averaging time of its adaptation
+    fix_variance_time_s: Positive = 0.5  # averaging time of its adaptation, at least 50 fixes
     least_fix_variance_mm2: Positive = 0.01
     # Reported slip: its averaging time, against the encoders' noise, and bounds
     report_time_s: Positive = 0.02
@@ -189,7 +189,8 @@ class Reckoning(ABC):
     Readings are collected over an interval of several periods. What is reported in between is reckoned on from
     the last state. A fix that comes late is compared with the pose at its time: the pose now less the way
     since. The fixes' variance is adapted from the differences of successive fixes along the way, which have
-    twice the variance of a fix; outliers count in it only up to the gate.
+    twice the variance of a fix; outliers count in it only up to the gate. If all fixes of a second are
+    beyond the gate, it is raised to what they show.
 
     Parameters
     ----------
@@ -210,6 +211,8 @@ class Reckoning(ABC):
 
     LONGEST_DELAY_S = 0.5  # of a fix; later ones are taken as of that age
     GATE = 13.8  # of the normalised innovation squared: one in a thousand fixes lies beyond
+    GIVE_UP_S = 1.0  # all fixes of this time beyond the gate are no outliers
+    LARGEST_WEIGHT = 0.02  # of a fix in the adapted variance
 
     def __init__(
         self, robot: RobotParameters, period_s: float, interval_s: float, noise: Noise
@@ -227,7 +230,6 @@ class Reckoning(ABC):
         self._by_torque = 1000.0 * period_s / mass
         self._by_wheels = 2.0 * robot.wheel_inertia_kg_mm2 / (mass * robot.wheel_radius_mm)
         self._report = sample_weight(period_s, noise.report_time_s)
-        self._adapt = sample_weight(period_s, noise.fix_variance_time_s)
         self._variances = noise.variances(self._every * period_s)
 
     def reset(self, pose: np.ndarray) -> None:
@@ -240,7 +242,10 @@ class Reckoning(ABC):
         self._slips = [0.0, 0.0]
         self._way = (0.0, 0.0)
         self._ways = deque([self._way], maxlen=round(self.LONGEST_DELAY_S / self._dt_s) + 1)
-        self._last_off: tuple[float, float] | None = None
+        self._last_off: tuple[float, float, float] | None = (
+            None  # of the last fix: when, and off the way
+        )
+        self._believed_s = 0.0  # when a fix was last within the gate
         self._collect()
         self._expect()
 
@@ -330,11 +335,19 @@ class Reckoning(ABC):
             s_xx * s_yy - s_xy * s_xy
         )
         if self._last_off is not None:
-            step_x, step_y = off_x - self._last_off[0], off_y - self._last_off[1]
+            last_s, last_x, last_y = self._last_off
+            step_x, step_y = off_x - last_x, off_y - last_y
             square = min(0.25 * (step_x * step_x + step_y * step_y), 0.5 * self.GATE * variance)
-            changed = variance + self._adapt * (square - variance)
+            apart_s = max(taken_s - last_s, 0.0)
+            weight = min(apart_s / self.noise.fix_variance_time_s, self.LARGEST_WEIGHT)
+            changed = variance + weight * (square - variance)
             self.fix_variance = max(changed, self.noise.least_fix_variance_mm2)
-        self._last_off = (off_x, off_y)
+        self._last_off = (taken_s, off_x, off_y)
+        if nis <= self.GATE:
+            self._believed_s = t_s
+        elif t_s - self._believed_s >= self.GIVE_UP_S:
+            self._believed_s = t_s
+            self.fix_variance = max(self.fix_variance, 0.5 * (d_x * d_x + d_y * d_y))
         self._take(Fix(taken_s, x, y, way_x, way_y, nis))
         return nis
 

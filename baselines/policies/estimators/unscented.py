@@ -26,7 +26,6 @@ from baselines.policies.estimators.reckoning import (
 from tlf_env.physics.vehicle import RobotParameters
 
 INTERVAL_S = 0.01
-GIVE_UP_S = 1.0  # after fixes beyond the gate for so long, they are believed
 
 Function = Callable[[np.ndarray], np.ndarray]  # of rows (point, state), row by row
 
@@ -86,8 +85,7 @@ class UnscentedKalmanFilter:
 class UnscentedEstimator(Reckoning):
     """The model of :mod:`~baselines.policies.estimators.reckoning` in an unscented Kalman filter.
 
-    A fix whose normalised innovation squared is beyond the gate is left out. If all fixes of a second are
-    beyond it, they are believed.
+    A fix whose normalised innovation squared is beyond the gate is left out.
 
     Parameters and errors are those of :class:`Reckoning`.
     """
@@ -104,18 +102,14 @@ class UnscentedEstimator(Reckoning):
     def reset(self, pose: np.ndarray) -> None:
         """Start at the true pose ``(x mm, y mm, θ rad)``, at rest."""
         self._fixes, self._sum_x, self._sum_y = 0, 0.0, 0.0
-        self._believed_s = 0.0  # when a fix was last within the gate
         super().reset(pose)
         self._filter = UnscentedKalmanFilter(self.state, self.covariance)
 
     def _take(self, fix: Fix) -> None:
         if fix.nis <= self.GATE:
-            self._believed_s = fix.t_s
-        elif fix.t_s - self._believed_s < GIVE_UP_S:
-            return
-        self._fixes += 1
-        self._sum_x += fix.x - fix.way_x
-        self._sum_y += fix.y - fix.way_y
+            self._fixes += 1
+            self._sum_x += fix.x - fix.way_x
+            self._sum_y += fix.y - fix.way_y
 
     def _correct(self, t_s: float, past: Interval) -> None:
         """One step of the filter; the fixes of the interval are moved on to its end and averaged."""
