@@ -1,4 +1,4 @@
-"""How good the estimators are, and whether they know it: the tables of ``docs/controller/estimators.md``.
+"""Errors of the estimators, and whether their covariances explain them: the tables of ``docs/controller/estimators.md``.
 
 ``python docs/figures/make_estimators.py`` drives 3 seeds of each cell for 30 s, with contact. A seed takes
 about 4 minutes of processor time, nearly all of it for the two estimators in Python. It needs no extra. It
