@@ -13,6 +13,7 @@ from baselines.policies.laws.textbook import FeedbackLinearisation, Kanayama
 from baselines.policies.registry import fit_policy, make_policy, policy_hash, policy_names
 from baselines.policies.systems import (
     ESTIMATORS,
+    PYTHON_ESTIMATORS,
     LimitedLaw,
     Limiter,
     load_limiter,
@@ -304,3 +305,48 @@ def test_a_smoothed_estimator_is_the_filter_with_smoothed_broadcasts():
     said = r"^system '.*' names the broadcast_smoothing_s 0\.1; the scenario sets 0\.2$"
     with pytest.raises(ValueError, match=said):
         fit_policy("kanayama+ekf-gyro-smoothed+body", other)
+
+
+def test_an_estimator_without_a_part_merges_with_the_scenarios_parameters():
+    given = load_scenario("infinity", ekf_slip={"fix_variance_mm2": 0.7})
+    fitted = fit_policy("kanayama+ekf-slip-without-jumps+body", given)
+    found = fitted.scenario.ekf_slip
+    assert (found.most_acceleration_mm_s2, found.most_yaw_acceleration_rad_s2) == (None, None)
+    assert found.fix_variance_mm2 == 0.7
+    assert fitted.scenario.estimator == "ekf-slip"
+    fields = fit_policy("kanayama+ekf-gyro-without-torques", SCENARIO).scenario
+    assert (fields.estimator, fields.ekf_gyro.torque_time_s) == ("ekf-gyro", None)
+    assert fit_policy("kanayama+ekf-slip", SCENARIO).scenario.ekf_slip == SCENARIO.ekf_slip
+
+
+def test_a_scenario_that_sets_what_a_name_leaves_out_is_refused():
+    given = load_scenario("infinity", ekf_slip={"most_acceleration_mm_s2": 500})
+    said = (
+        r"^system '.*' names the ekf_slip\.most_acceleration_mm_s2 None; the scenario sets 500\.0$"
+    )
+    with pytest.raises(ValueError, match=said):
+        fit_policy("kanayama+ekf-slip-without-jumps+body", given)
+    agreeing = load_scenario("infinity", ekf_slip={"most_acceleration_mm_s2": None})
+    found = fit_policy("kanayama+ekf-slip-without-jumps+body", agreeing).scenario.ekf_slip
+    assert found.most_yaw_acceleration_rad_s2 is None
+
+
+@pytest.mark.parametrize("estimator", PYTHON_ESTIMATORS)
+def test_an_estimator_in_python_is_a_part_and_is_refused_on_batch(estimator):
+    name = f"kanayama+{estimator}+body"
+    fitted = fit_policy(name, SCENARIO)
+    assert fitted.scenario.part_paths == {"estimator": PYTHON_ESTIMATORS[estimator]}
+    assert not fitted.policy.privileged
+    assert (
+        policy_label({"policy": name, "overrides": fitted.overrides, "privileged": False}) == name
+    )
+    said = (
+        rf"^system '.*': estimator '{estimator}' is a Python object, which plant 'batch' cannot .*$"
+    )
+    with pytest.raises(ValueError, match=said):
+        fit_policy(name, load_scenario("infinity", plant="batch"))
+
+
+def test_the_source_of_an_estimator_in_python_counts_as_the_systems():
+    names = [f"kanayama+{one}+body" for one in ("ekf", *PYTHON_ESTIMATORS)]
+    assert len({policy_hash(name, make_policy(name, SCENARIO)) for name in names}) == len(names)

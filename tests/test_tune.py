@@ -549,6 +549,16 @@ def test_a_start_names_its_estimator_whatever_the_search_that_it_is_like(tmp_pat
     assert search.use_of(settings) == "kanayama:FILE+ekf-gyro-smoothed+body"
 
 
+def test_a_search_from_a_system_without_a_part_keeps_it_off(tmp_path):
+    path = tmp_path / "mine.yaml"
+    own = {"start": "kanayama:bounded+ekf-slip-without-jumps+body", "horizon_s": 30}
+    ranges = {"law.k_x_per_s": {"low": 1, "high": 5}}
+    path.write_text(yaml.safe_dump({"like": "tuned", "search": ranges, **own}))
+    for scenario in load_tune(path).scenarios(None).values():
+        assert scenario.estimator == "ekf-slip"
+        assert scenario.ekf_slip.most_acceleration_mm_s2 is None
+
+
 @pytest.mark.parametrize("name", LAWS)
 def test_every_law_has_a_search_with_the_tasks_and_the_budget_of_all(name):
     if name == "nmpc":
@@ -568,6 +578,7 @@ def test_every_law_has_a_search_with_the_tasks_and_the_budget_of_all(name):
             {"start": "reference:tuned+ekf-slip-smoothed", "search": SMALL["search"]},
             "a controller is searched without smoothed broadcasts",
         ),
+        ({"start": "kanayama+ukf+body"}, "estimator 'ukf' is a Python object; a search runs on"),
         ({"start": "kanayama:no_such"}, "kanayama 'no_such' is not one of bounded"),
         ({"start": "kanayama+ekf-slip+bodi"}, "limiter 'bodi' is not one of body"),
         ({"estimator": "ekf"}, "names the estimator 'ekf-slip'; estimator is 'ekf'"),

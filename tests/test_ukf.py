@@ -1,4 +1,4 @@
-"""The unscented Kalman filter of the examples: its linear limit, and what it achieves on robots that slip."""
+"""The unscented Kalman filter: its linear limit, and what the example achieves with it on robots that slip."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 
 import tlf_env
 from baselines import ReferencePolicy
+from baselines.policies.estimators.unscented import UnscentedKalmanFilter, scaled_weights
 from tlf_env.onboard.parts import Estimated, Readings
 from tlf_env.physics.parameters import RobotParameters
 
@@ -54,7 +55,7 @@ def test_the_weights_are_those_of_the_scaled_transform(
     states: int, alpha: float, beta: float, kappa: float
 ) -> None:
     """Weights of the mean sum to 1, those of the covariance to 2 − α² + β, and the points have P."""
-    weights = ukf.scaled_weights(states, alpha, beta, kappa)
+    weights = scaled_weights(states, alpha, beta, kappa)
     assert weights.mean.sum() == pytest.approx(1.0)
     assert weights.covariance.sum() == pytest.approx(2.0 - alpha**2 + beta)
     assert 2.0 * weights.mean[1] * weights.distance**2 == pytest.approx(1.0)
@@ -65,7 +66,7 @@ def test_the_weights_are_those_of_the_scaled_transform(
 def test_a_linear_model_gives_the_kalman_filter(seed: int, states: int) -> None:
     rng = np.random.default_rng(seed)
     P, x = random_covariance(rng, states), rng.normal(size=states)
-    mine = ukf.UnscentedKalmanFilter(x, P)
+    mine = UnscentedKalmanFilter(x, P)
     for _ in range(4):
         A, Q = rng.normal(size=(states, states)), random_covariance(rng, states)
         H, R = rng.normal(size=(2, states)), random_covariance(rng, 2)
@@ -85,7 +86,7 @@ def test_the_mean_of_a_quadratic_function_is_exact(seed: int) -> None:
     """E[xᵀBx] = mᵀBm + tr(BP), which an extended Kalman filter takes for mᵀBm."""
     rng = np.random.default_rng(seed)
     m, P, B = rng.normal(size=3), random_covariance(rng, 3), rng.normal(size=(3, 3))
-    mine = ukf.UnscentedKalmanFilter(m, P)
+    mine = UnscentedKalmanFilter(m, P)
     mine.predict(lambda points: np.einsum("ki,ij,kj->k", points, B, points)[:, None], np.eye(1))
     assert mine.mean[0] == pytest.approx(m @ B @ m + np.trace(B @ P), rel=1e-9, abs=1e-9)
 

@@ -92,7 +92,8 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
 
     A policy asks by an attribute ``scenario_overrides``, which maps fields of :data:`OVERRIDABLE` to
     values; a learned policy has it from its card. A field that the scenario's file or the caller has
-    set keeps its value.
+    set keeps its value. Parameters of a filter that a system's name sets are merged with those that the
+    scenario sets.
 
     Parameters
     ----------
@@ -103,7 +104,8 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
     ------
     ValueError
         as for :func:`make_policy`, if a policy asks for a field that it may not set, or for an invalid
-        value, and if a system names another estimator than the file or the caller has set.
+        value, and if a system names another estimator, or another value of its parameters, than the file or
+        the caller has set.
     """
     policy = _made(name, scenario, trust=trust)
     asked = _asked(name, policy, scenario)
@@ -159,15 +161,32 @@ def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
             f"policy {name!r}: scenario_overrides must map fields of {', '.join(OVERRIDABLE)}; "
             f"got {asked!r}"
         )
+    named: Mapping[str, Any] = {}
     system = parse_system(name)
     if system is not None:
-        for field, value in ESTIMATORS[system.estimator].items():
-            if field in scenario.model_fields_set and getattr(scenario, field) != value:
-                raise ValueError(
-                    f"system {name!r} names the {field} {value!r}; the scenario sets "
-                    f"{getattr(scenario, field)!r}"
-                )
-    return {field: asked[field] for field in asked if field not in scenario.model_fields_set}
+        named = ESTIMATORS[system.estimator]
+        _check_named(name, named, scenario)
+    # Parameters of a filter that a system's name sets are merged with those that the scenario sets.
+    free = {
+        field
+        for field in asked
+        if field not in scenario.model_fields_set or isinstance(named.get(field), Mapping)
+    }
+    return {field: asked[field] for field in asked if field in free}
+
+
+def _check_named(name: str, named: Mapping[str, Any], scenario: BaseModel, group: str = "") -> None:
+    """Check that the scenario sets no other value of a field that a system's name sets."""
+    for field, value in named.items():
+        if field not in scenario.model_fields_set:
+            continue
+        given = getattr(scenario, field)
+        if isinstance(value, Mapping):
+            _check_named(name, value, given, f"{field}.")
+        elif given != value:
+            raise ValueError(
+                f"system {name!r} names the {group}{field} {value!r}; the scenario sets {given!r}"
+            )
 
 
 def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:

@@ -26,7 +26,7 @@ from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.controllers import controller, controller_names
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.limiter import TwistLimits
-from tlf_env.onboard.parts import Policy
+from tlf_env.onboard.parts import Policy, load_part
 from tlf_env.onboard.spacing import Spacing
 from tlf_env.onboard.tracking import Controller, ControllerRow, controller_row
 from tlf_env.task.actions import ACTION_SIZE, twist_action
@@ -39,7 +39,12 @@ NOT_LIMITED = (".zip", ".safetensors")  # learned policies, whose paths may cont
 
 BROADCAST_SMOOTHING_S = 0.1
 SMOOTHED: tuple[EstimatorKind, ...] = ("ekf", "ekf-slip", "ekf-gyro")
-# The fields of the scenario that an estimator's name sets: the filter on board, and what is broadcast of it.
+PYTHON_ESTIMATORS = {
+    "ukf": "baselines.policies.estimators.unscented:UnscentedEstimator",
+    "moving-horizon": "baselines.policies.estimators.moving_horizon:MovingHorizonEstimator",
+}
+# The fields of the scenario that an estimator's name sets: the filter on board, parameters of it, and what is
+# broadcast of it.
 ESTIMATORS: dict[str, dict[str, Any]] = {
     **{kind: {"estimator": kind} for kind in ESTIMATOR_KINDS},
     **{
@@ -49,6 +54,12 @@ ESTIMATORS: dict[str, dict[str, Any]] = {
         }
         for kind in SMOOTHED
     },
+    "ekf-slip-without-jumps": {
+        "estimator": "ekf-slip",
+        "ekf_slip": {"most_acceleration_mm_s2": None, "most_yaw_acceleration_rad_s2": None},
+    },
+    "ekf-gyro-without-torques": {"estimator": "ekf-gyro", "ekf_gyro": {"torque_time_s": None}},
+    **{name: {"estimator": path} for name, path in PYTHON_ESTIMATORS.items()},
 }
 
 
@@ -235,10 +246,16 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
     Raises
     ------
     ValueError
-        in one line, for an unknown part, an invalid file, or a lead without a first preview above 0.
+        in one line, for an unknown part, an invalid file, a lead without a first preview above 0, or an
+        estimator in Python on the plant ``batch``.
     """
     name = str(system)
-    limiter, files = None, []
+    limiter, files = None, estimator_files(system.estimator)
+    if files and scenario.plant == "batch":
+        raise ValueError(
+            f"system {name!r}: estimator {system.estimator!r} is a Python object, which plant 'batch' cannot "
+            "run; use plant 'pymunk'"
+        )
     if system.limiter is not None:
         path = preset_or_file("limiter", system.limiter)
         if path is None:
@@ -268,6 +285,19 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
     policy.privileged = system.estimator == "truth"
     policy.scenario_overrides = {**asked, **ESTIMATORS[system.estimator]}
     return policy
+
+
+def estimator_files(name: str) -> list[Path]:
+    """Source files of an estimator in Python, by its name in systems; none for a compiled one."""
+    if name not in PYTHON_ESTIMATORS:
+        return []
+    package = PYTHON_ESTIMATORS[name].rpartition(".")[0]
+    made: Any = load_part(PYTHON_ESTIMATORS[name])
+    return [
+        Path(inspect.getfile(one))
+        for one in inspect.getmro(made)
+        if one.__module__.startswith(package)
+    ]
 
 
 def _unknown(name: str, part: str, given: str, allowed: Iterable[str]) -> ValueError:

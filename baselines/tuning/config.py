@@ -286,10 +286,13 @@ class TuneConfig(Frozen):
                 scenario = load_scenario(
                     task,
                     disturbance=disturbance,
-                    ekf_slip=None if ekf_slip is None else ekf_slip.model_dump(),
                     horizon_s=self.horizon_s,
                     plant="batch",
-                    **{"estimator": self.estimator, **asked},
+                    **{
+                        "estimator": self.estimator,
+                        "ekf_slip": None if ekf_slip is None else ekf_slip.model_dump(),
+                        **asked,
+                    },
                 )
                 if (scenario.action, scenario.observation) != ("twist", "tracking"):
                     raise ValueError(

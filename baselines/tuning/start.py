@@ -11,6 +11,7 @@ from baselines.policies.laws.catalogue import LAWS, law_of, read_law
 from baselines.policies.laws.law import LawFile
 from baselines.policies.systems import (
     ESTIMATORS,
+    PYTHON_ESTIMATORS,
     LimitedLaw,
     Limiter,
     SystemName,
@@ -39,6 +40,8 @@ class LawStart(Limiter):
             raise ValueError(f"law {self.law!r} is not one of {', '.join(LAWS)}")
         if self.estimator is not None and self.estimator not in ESTIMATORS:
             raise ValueError(f"estimator {self.estimator!r} is not one of {', '.join(ESTIMATORS)}")
+        if self.estimator in PYTHON_ESTIMATORS:
+            raise ValueError(_not_searched(self.estimator))
         law_file(self.law, self.parameters)
         return self
 
@@ -82,6 +85,11 @@ class Named(NamedTuple):
     estimator: str | None  # the one that the name has, if any
 
 
+def _not_searched(estimator: str) -> str:
+    """Why there is no search with an estimator in Python."""
+    return f"estimator {estimator!r} is a Python object; a search runs on the plant 'batch'"
+
+
 def law_file(law: str, parameters: dict[str, Any]) -> LawFile:
     """The file of a law with some parameters.
 
@@ -119,6 +127,8 @@ def named_start(name: str) -> Named:
     head, _, tail = system.controller.partition(":")
     limiter = None if system.limiter is None else load_limiter(system.limiter)
     named = system.estimator or None
+    if named in PYTHON_ESTIMATORS:
+        raise ValueError(f"start {name!r}: {_not_searched(named)}")
     estimator = None if named is None else str(ESTIMATORS[named]["estimator"])
     if head in LAWS:
         given = read_law(head, tail).model_dump(exclude={"found"})
@@ -131,6 +141,9 @@ def named_start(name: str) -> Named:
     if estimator is None:
         return Named(controller(name), None)
     if named != estimator:
-        raise ValueError(f"start {name!r}: a controller is searched without smoothed broadcasts")
+        raise ValueError(
+            f"start {name!r}: a controller is searched without smoothed broadcasts, and with the parameters "
+            f"of {estimator!r} that it finds itself"
+        )
     known = controller(tail or "consistent") if head == "reference" else controller(head)
     return Named(behind(known, limiter or own_limiter(known)), estimator)

@@ -29,6 +29,7 @@ COVARIANCE = np.triu_indices(3)  # its order in an Estimate, after the pose
 SLIP = [SlipEstimate._fields.index(name) for name in ("delta_1", "delta_2")]
 ODOMETRY = [Trace._fields.index(name) for name in ("distance", "turn")]
 MOVED = [Trace._fields.index(name) for name in ("moved", "turned")]
+NIS = Trace._fields.index("nis")
 
 
 def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[str, Factory]:
@@ -147,6 +148,7 @@ class Parts:
             self._odometry[:, robot] = odometry
             # The engine's sums lack the twist, and have the slip of the substep before.
             traces[MOVED, robot, 0] = self._moved[:, robot]
+            traces[NIS, robot, 0] += result.nis
 
     def _readings(self, arrays: Arrays, substep: int, robot: int, settings: Settings) -> Readings:
         """What a robot's estimator receives of a substep."""

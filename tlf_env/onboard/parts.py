@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import importlib
 import inspect
+import math
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any, NamedTuple, Protocol
 import numpy as np
 
 from tlf_env.common.errors import shown
+from tlf_env.common.models import as_float, is_number
 from tlf_env.onboard.observer import Message, Reference
 
 PART_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_<][\w.<>]*$"  # <locals>, <lambda>: given as objects
@@ -56,6 +58,7 @@ class Estimated(NamedTuple):
     twist: Any = None  # (2,) u₁ (mm/s) and u₂ (rad/s); None: wheels' odometry and the slip
     slip: Any = None  # (2,) δ₁ (mm/s) and δ₂ (rad/s) of eq. (14); None: 0
     covariance: Any = None  # (3, 3) of the pose: mm², mm·rad, rad²; None: 0
+    nis: Any = None  # normalised innovation squared of the fix of this period; None: 0
 
 
 class Estimator(Protocol):
@@ -255,8 +258,8 @@ def checked_estimate(answer: Any, what: str) -> Estimated:
     Raises
     ------
     ValueError
-        naming the part and the quantity, if a shape is wrong, a number is not finite, or the covariance is
-        not symmetric or has a negative variance.
+        naming the part and the quantity, if a shape is wrong, a number is not finite, the covariance is
+        not symmetric or has a negative variance, or the normalised innovation squared is negative.
     """
     given = answer if isinstance(answer, Estimated) else Estimated(answer)
     return Estimated(
@@ -266,6 +269,22 @@ def checked_estimate(answer: Any, what: str) -> Estimated:
         covariance=NO_COVARIANCE
         if given.covariance is None
         else checked_covariance(given.covariance, what),
+        nis=0.0 if given.nis is None else checked_nis(given.nis, what),
+    )
+
+
+def checked_nis(value: Any, what: str) -> float:
+    """A normalised innovation squared, as a float.
+
+    Raises
+    ------
+    ValueError
+        naming the part, for anything but one finite number of at least 0.
+    """
+    if is_number(value) and 0.0 <= as_float(value) < math.inf:
+        return as_float(value)
+    raise ValueError(
+        f"{what} must return a normalised innovation squared of at least 0, got {shown(value)}"
     )
 
 

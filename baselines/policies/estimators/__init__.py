@@ -1,0 +1,1 @@
+"""Estimators in Python: an unscented Kalman filter and a moving-horizon estimator of the same model."""
