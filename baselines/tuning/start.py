@@ -20,7 +20,7 @@ from baselines.policies.systems import (
     parse_system,
 )
 from tlf_env.common.errors import one_line
-from tlf_env.onboard.controllers import controller
+from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -132,5 +132,5 @@ def named_start(name: str) -> Named:
         return Named(controller(name), None)
     if named != estimator:
         raise ValueError(f"start {name!r}: a controller is searched without smoothed broadcasts")
-    known = controller(tail or "consistent") if head == "reference" else controller(head)
+    known = controller(tail or DEFAULT_CONTROLLER) if head == "reference" else controller(head)
     return Named(behind(known, limiter or own_limiter(known)), estimator)
