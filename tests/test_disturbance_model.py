@@ -66,8 +66,7 @@ def test_an_adversary_does_what_the_channel_does(path):
     apart = 0.0 if not path.startswith("radio.") else 20.0
     same = run({**beside, path: SHOWS[path]}, seconds=2.0, horizon_s=100.0)
     assert imposed.formation.state() == pytest.approx(same.formation.state(), abs=apart)
-    if not path.startswith("gyro."):  # no part of the reference reads it
-        assert (same.formation.state() != run(seconds=2.0, horizon_s=100.0).formation.state()).any()
+    assert (same.formation.state() != run(seconds=2.0, horizon_s=100.0).formation.state()).any()
 
 
 @pytest.mark.parametrize(

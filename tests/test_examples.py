@@ -118,7 +118,7 @@ def test_training_runs_and_saves(
     out = tmp_path / "follower.safetensors"
     example.main(robot_steps=400, formations=4, horizon_s=5.0, out=out)
     assert "reference" in capsys.readouterr().out
-    assert load_policy(out).card.residual_base == "tuned"
+    assert load_policy(out).card.residual_base == "linearised"
 
 
 # What the parts of the examples are worth, on the whole task

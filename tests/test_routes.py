@@ -241,6 +241,7 @@ def test_a_follower_hears_its_predecessor_as_it_was_one_gap_ago() -> None:
         time_gap_s=0.4,
         preview_s=(0.2,),
         end_on=(),
+        **PAPERS,
     )
     seen, infos = env.reset(seed=0)
     said = []  # (pose of the estimate, wheel odometry) of every robot at every step
