@@ -11,6 +11,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from helpers import PAPERS
 
 import tlf_env
 from baselines import ReferencePolicy, load_policy
@@ -135,9 +136,9 @@ def test_training_runs_and_saves(
 )
 @pytest.mark.slow
 def test_the_parts_hold_the_infinity(example: ModuleType, role: str, part: str) -> None:
-    env = tlf_env.parallel_env("infinity", **{role: getattr(example, part)})
+    env = tlf_env.parallel_env("infinity", **PAPERS | {role: getattr(example, part)})
     seen, _ = env.reset(seed=0)
-    policy, errors = ReferencePolicy(), []
+    policy, errors = ReferencePolicy("consistent"), []
     while env.agents:
         actions = {agent: policy.predict(row)[0] for agent, row in seen.items()}
         seen, *_, infos = env.step(actions)
