@@ -79,6 +79,7 @@ class ReferencePolicy:
             names += [name for name in tracking_entries(preview_s[:1]) if name not in now]
         entries = tracking_entries(preview_s)
         self._columns = find_columns(names, entries)
+        self._preview_s = tuple(preview_s)
         self._needed = int(self._columns.places.max()) + 1
         self._scales = np.array([entries[name].scale for name in names])
         self.scenario_overrides = asked
@@ -103,8 +104,9 @@ class ReferencePolicy:
         observation = np.asarray(observation)
         if observation.ndim not in (1, 2) or observation.shape[-1] < self._needed:
             raise ValueError(
-                f"the observation has the shape {observation.shape}; a tracking observation has at "
-                f"least {self._needed} entries, in one row or a batch of rows"
+                f"the observation has the shape {observation.shape}; a tracking observation with "
+                f"preview_s {self._preview_s} has at least {self._needed} entries, in one row or a batch "
+                "of rows"
             )
         rows = np.atleast_2d(observation)
         if not self._columns.leading:
