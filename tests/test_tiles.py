@@ -21,12 +21,18 @@ from tlf_env.engine.layout import (
     array_reader,
     array_writer,
 )
-from tlf_env.engine.sensors import disturbed_encoders, measured_fix, sense_robot
+from tlf_env.engine.sensors import (
+    disturbed_encoders,
+    measured_fix,
+    sense_robot,
+    sense_with_gyro,
+)
 from tlf_env.engine.settings import Settings, make_settings
 from tlf_env.engine.substeps import commanded_torques, floor_under, trace_drive, undisturbed
 from tlf_env.engine.tiles import WIDTH, advance
 from tlf_env.numerics.compiled import driver
 from tlf_env.numerics.rows import reader, writer
+from tlf_env.onboard.kinds import EKF_GYRO
 from tlf_env.physics.kernel import substep
 from tlf_env.physics.state import Push, advance_pose
 from tlf_env.task.actions import TWIST
@@ -126,6 +132,8 @@ read_loop_state, write_loop_state = array_reader("loop_state"), array_writer("lo
 read_sensors, write_sensors = array_reader("sensors"), array_writer("sensors")
 read_estimate, write_estimate = array_reader("estimate"), array_writer("estimate")
 read_slip, write_slip = array_reader("slip"), array_writer("slip")
+read_gyro, write_gyro = array_reader("gyro"), array_writer("gyro")
+read_gyro_ekf = array_reader("gyro_ekf")
 read_trace, write_trace = array_reader("trace"), array_writer("trace")
 read_command = array_reader("command")
 read_belief = array_reader("belief")
@@ -175,25 +183,43 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                 )
                 motion = advance_pose(motion, s.dt)
                 draw = Draw(a.seeds[lane], r, a.clock[lane, 2], tick + 1)
-                sensors, estimate, slip, trace, sample = sense_robot(
-                    body,
-                    read_belief(a.constants, r, lane),
-                    ekf,
-                    slip_ekf,
-                    motion,
-                    disturbed_encoders(motion, effects, draw),
-                    measured_fix(body, motion, effects, draw),
-                    YawRate(motion.w),
-                    WheelPair(commanded_l, commanded_r),
-                    sensors,
-                    read_estimate(a.states, r, lane),
-                    read_slip(a.states, r, lane),
-                    trace,
-                    order,
-                    k,
-                    s.estimator,
-                    s.dt,
-                )
+                if s.estimator == EKF_GYRO:
+                    sensors, estimate, slip, found, trace, sample = sense_with_gyro(
+                        body,
+                        read_belief(a.constants, r, lane),
+                        read_gyro_ekf(a.constants, r, lane),
+                        disturbed_encoders(motion, effects, draw),
+                        measured_fix(body, motion, effects, draw),
+                        YawRate(motion.w),
+                        WheelPair(commanded_l, commanded_r),
+                        sensors,
+                        read_estimate(a.states, r, lane),
+                        read_slip(a.states, r, lane),
+                        read_gyro(a.states, r, lane),
+                        trace,
+                        s.dt,
+                    )
+                    write_gyro(a.states, r, lane, found)
+                else:
+                    sensors, estimate, slip, trace, sample = sense_robot(
+                        body,
+                        read_belief(a.constants, r, lane),
+                        ekf,
+                        slip_ekf,
+                        motion,
+                        disturbed_encoders(motion, effects, draw),
+                        measured_fix(body, motion, effects, draw),
+                        YawRate(motion.w),
+                        WheelPair(commanded_l, commanded_r),
+                        sensors,
+                        read_estimate(a.states, r, lane),
+                        read_slip(a.states, r, lane),
+                        trace,
+                        order,
+                        k,
+                        s.estimator,
+                        s.dt,
+                    )
                 write_motion(a.states, r, lane, motion)
                 write_contact(a.states, r, lane, contact)
                 write_loop_state(a.states, r, lane, held)

@@ -140,9 +140,11 @@ PUSH_INPUT = FLOOR_INPUT + len(Floor._fields)
 read_body = array_reader("body")
 read_belief, write_belief = array_reader("belief"), array_writer("belief")
 read_slip_ekf, write_slip_ekf = array_reader("slip_ekf"), array_writer("slip_ekf")
+read_gyro_ekf, write_gyro_ekf = array_reader("gyro_ekf"), array_writer("gyro_ekf")
 read_motion, write_motion = array_reader("motion"), array_writer("motion")
 read_estimate, write_estimate = array_reader("estimate"), array_writer("estimate")
 read_slip = array_reader("slip")
+read_gyro = array_reader("gyro")
 read_ekf = array_reader("ekf")
 read_sensors = array_reader("sensors")
 read_way, write_way = slot_reader(Way), slot_writer(Way)
@@ -167,17 +169,15 @@ def constant_rows(scenario: Scenario) -> dict[str, Sequence[tuple[float, ...]]]:
         loop = WheelLoopParameters()
     robots, dt_s = scenario.robot_models, scenario.physics_period_s
     bodies = [body(robot) for robot in robots]
-    filters = [slip_ekf_constants(scenario.ekf_slip, dt_s)] * len(robots)
-    if scenario.estimator == "ekf-gyro":
-        gyro = scenario.ekf_gyro
-        if scenario.plant == "kinematic":  # there are no torques
-            gyro = gyro.model_copy(update={"torque_time_s": None})
-        filters = [gyro_ekf_constants(gyro, one, dt_s) for one in bodies]
+    gyro = scenario.ekf_gyro
+    if scenario.plant == "kinematic":  # there are no torques
+        gyro = gyro.model_copy(update={"torque_time_s": None})
     return {
         "body": bodies,
         "wheel_loop": [digital_wheel_loop(loop, dt_s)] * len(robots),
         "ekf": [ekf_constants(scenario.ekf)] * len(robots),
-        "slip_ekf": filters,
+        "slip_ekf": [slip_ekf_constants(scenario.ekf_slip, dt_s)] * len(robots),
+        "gyro_ekf": [gyro_ekf_constants(gyro, one, dt_s) for one in bodies],
         "belief": [Belief(radius_l=1.0, radius_r=1.0, h=one.h) for one in bodies],
         "speed_observer": [
             speed_observer_row(loop.speed_observer_rad_s, one, dt_s) for one in bodies

@@ -19,6 +19,7 @@ from tlf_env.disturbances.channels import Effects
 from tlf_env.numerics.rows import reader, row_reader, row_writer, writer
 from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.estimator import Ekf, Estimate
+from tlf_env.onboard.gyro_estimator import GyroEkf, GyroEstimate
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
 from tlf_env.onboard.speed_observer import SpeedObserverRow, SpeedObserverState
 from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState
@@ -201,6 +202,7 @@ ROWS = (
     Row("wheel_loop", WheelLoopRow, Kind.CONSTANT),
     Row("ekf", Ekf, Kind.CONSTANT),
     Row("slip_ekf", SlipEkf, Kind.CONSTANT),
+    Row("gyro_ekf", GyroEkf, Kind.CONSTANT),
     Row("belief", Belief, Kind.CONSTANT),
     Row("speed_observer", SpeedObserverRow, Kind.CONSTANT),
     Row("motion", Motion, Kind.STATE),
@@ -211,6 +213,7 @@ ROWS = (
     Row("commanded", WheelPair, Kind.STATE),  # torques within the motors' limits
     Row("estimate", Estimate, Kind.STATE),
     Row("slip", SlipEstimate, Kind.STATE),
+    Row("gyro", GyroEstimate, Kind.STATE),
     Row("trace", Trace, Kind.STATE),
     Row("wanted", WheelPair, Kind.CONTROL),  # wheel speeds or torques that the action asks for
     Row("wanted_before", WheelPair, Kind.CONTROL),  # those of the step before

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 
 from tlf_env.disturbances.channels import (
@@ -32,8 +34,14 @@ from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.numerics.rows import replacing
 from tlf_env.onboard.calibration import Belief, believed_odometry
 from tlf_env.onboard.estimator import Ekf, Estimate, correct, predict
-from tlf_env.onboard.gyro_estimator import correct_with_gyro, predict_with_gyro
-from tlf_env.onboard.kinds import EKF, EKF_GYRO, EKF_SLIP, TRUTH
+from tlf_env.onboard.gyro_estimator import (
+    GyroEkf,
+    GyroEstimate,
+    correct_with_gyro,
+    predict_with_gyro,
+    reported_slip,
+)
+from tlf_env.onboard.kinds import EKF, EKF_SLIP, TRUTH
 from tlf_env.onboard.slip_estimator import (
     SlipEkf,
     SlipEstimate,
@@ -163,6 +171,77 @@ def commanded_increments(
     return believed_odometry(wanted_l * dt, wanted_r * dt, body, belief)
 
 
+class Innovation(NamedTuple):
+    """Innovation of a position fix in world axes (mm), its NIS, and the estimated heading (rad)."""
+
+    d_x: float
+    d_y: float
+    nis: float
+    theta: float
+
+
+@law
+def sensed(
+    reading: Reading,
+    fix: Fix,
+    yaw_rate: YawRate,
+    commanded: WheelPair,
+    sensors: Sensors,
+    trace: Trace,
+    innovation: Innovation,
+    step_l: float,
+    step_r: float,
+    way_x: float,
+    way_y: float,
+    u_1: float,
+    u_2: float,
+    moved: float,
+    turned: float,
+    dt: float,
+) -> tuple[Sensors, Trace, Sample]:
+    """What is kept of a substep: encoders and way, sums over the control step, and the sample.
+
+    The steps of the encoders are in rad, the way is the sum of the estimator's own motions (mm), u₁ and u₂ are
+    the encoders' increments (mm, rad), ``moved`` and ``turned`` the sums of the estimator's.
+    """
+    from_x, from_y = (fix.way_x, fix.way_y) if fix.age > 0.0 else (way_x, way_y)
+    forward, right = body_errors(innovation.d_x, innovation.d_y, innovation.theta)
+    return (
+        Sensors(
+            encoder_l=reading.left,
+            encoder_r=reading.right,
+            speed_l=step_l / dt,
+            speed_r=step_r / dt,
+            way_x=way_x,
+            way_y=way_y,
+        ),
+        with_sensor_sums(
+            trace,
+            trace.distance + u_1,
+            trace.turn + u_2,
+            moved,
+            turned,
+            trace.innovation_forward + fix.here * forward,
+            trace.innovation_right + fix.here * right,
+            trace.nis + innovation.nis,
+            trace.fixes + fix.here,
+            trace.off_x + fix.here * (fix.x - from_x),
+            trace.off_y + fix.here * (fix.y - from_y),
+        ),
+        Sample(
+            fix_x=fix.x,
+            fix_y=fix.y,
+            step_l=step_l,
+            step_r=step_r,
+            has_fix=fix.here,
+            fix_age=fix.age,
+            gyro=yaw_rate.reading,
+            torque_l=commanded.left,
+            torque_r=commanded.right,
+        ),
+    )
+
+
 @law
 def sense_robot(
     body: Body,
@@ -208,18 +287,6 @@ def sense_robot(
         x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
         y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
         estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y, fix.here)
-    elif kind == EKF_GYRO:
-        before_x, before_y = estimate.x, estimate.y
-        torque = commanded.left + commanded.right
-        estimate, slip = predict_with_gyro(
-            estimate, slip, slip_ekf, u_1, yaw_rate.reading, torque, dt
-        )
-        way_x, way_y = way_x + (estimate.x - before_x), way_y + (estimate.y - before_y)
-        x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
-        y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
-        estimate, slip, d_x, d_y, nis = correct_with_gyro(
-            estimate, slip, slip_ekf, x, y, fix.here, u_2, yaw_rate.reading, dt
-        )
     elif kind == TRUTH:
         true_x, true_y = axle_midpoint(motion, body.d)
         ahead, yaw = forward_and_yaw(motion)
@@ -236,46 +303,74 @@ def sense_robot(
             p_yt=0.0,
             p_tt=0.0,
         )
-    moved = trace.moved + u_1 - slip.spin_1 + slip.delta_1 * dt
-    turned = trace.turned + u_2 - slip.spin_2 + slip.delta_2 * dt
-    if kind == EKF_GYRO:
-        moved = trace.moved + slip.advance + slip.speed_error * dt
-        turned = trace.turned + (yaw_rate.reading + slip.gyro_error) * dt
-    from_x, from_y = (fix.way_x, fix.way_y) if fix.age > 0.0 else (way_x, way_y)
-    forward, right = body_errors(d_x, d_y, estimate.theta)
-    return (
-        Sensors(
-            encoder_l=reading.left,
-            encoder_r=reading.right,
-            speed_l=step_l / dt,
-            speed_r=step_r / dt,
-            way_x=way_x,
-            way_y=way_y,
-        ),
-        estimate,
-        slip,
-        with_sensor_sums(
-            trace,
-            trace.distance + u_1,
-            trace.turn + u_2,
-            moved,
-            turned,
-            trace.innovation_forward + fix.here * forward,
-            trace.innovation_right + fix.here * right,
-            trace.nis + nis,
-            trace.fixes + fix.here,
-            trace.off_x + fix.here * (fix.x - from_x),
-            trace.off_y + fix.here * (fix.y - from_y),
-        ),
-        Sample(
-            fix_x=fix.x,
-            fix_y=fix.y,
-            step_l=step_l,
-            step_r=step_r,
-            has_fix=fix.here,
-            fix_age=fix.age,
-            gyro=yaw_rate.reading,
-            torque_l=commanded.left,
-            torque_r=commanded.right,
-        ),
+    sensors, trace, sample = sensed(
+        reading,
+        fix,
+        yaw_rate,
+        commanded,
+        sensors,
+        trace,
+        Innovation(d_x, d_y, nis, estimate.theta),
+        step_l,
+        step_r,
+        way_x,
+        way_y,
+        u_1,
+        u_2,
+        trace.moved + u_1 - slip.spin_1 + slip.delta_1 * dt,
+        trace.turned + u_2 - slip.spin_2 + slip.delta_2 * dt,
+        dt,
     )
+    return sensors, estimate, slip, trace, sample
+
+
+@law
+def sense_with_gyro(
+    body: Body,
+    belief: Belief,
+    ekf: GyroEkf,
+    reading: Reading,
+    fix: Fix,
+    yaw_rate: YawRate,
+    commanded: WheelPair,
+    sensors: Sensors,
+    estimate: Estimate,
+    slip: SlipEstimate,
+    found: GyroEstimate,
+    trace: Trace,
+    dt: float,
+) -> tuple[Sensors, Estimate, SlipEstimate, GyroEstimate, Trace, Sample]:
+    """As :func:`sense_robot`, with the estimator that uses the gyro and the torques."""
+    step_l, step_r = reading.left - sensors.encoder_l, reading.right - sensors.encoder_r
+    u_1, u_2 = believed_odometry(step_l, step_r, body, belief)
+    before_x, before_y = estimate.x, estimate.y
+    torque = commanded.left + commanded.right
+    estimate, found = predict_with_gyro(estimate, found, ekf, u_1, yaw_rate.reading, torque, dt)
+    way_x = sensors.way_x + (estimate.x - before_x)
+    way_y = sensors.way_y + (estimate.y - before_y)
+    x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
+    y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
+    estimate, found, d_x, d_y, nis = correct_with_gyro(
+        estimate, found, ekf, x, y, fix.here, u_2, yaw_rate.reading, dt
+    )
+    delta_1, delta_2 = reported_slip(found, ekf)
+    turned = (yaw_rate.reading * (1.0 + found.scale_error) + found.gyro_error) * dt
+    sensors, trace, sample = sensed(
+        reading,
+        fix,
+        yaw_rate,
+        commanded,
+        sensors,
+        trace,
+        Innovation(d_x, d_y, nis, estimate.theta),
+        step_l,
+        step_r,
+        way_x,
+        way_y,
+        u_1,
+        u_2,
+        trace.moved + found.advance + found.speed_error * dt,
+        trace.turned + turned,
+        dt,
+    )
+    return sensors, estimate, with_slip(slip, delta_1, delta_2), found, trace, sample

@@ -24,11 +24,13 @@ from tlf_env.engine.arrays import (
     read_belief,
     read_body,
     read_estimate,
+    read_gyro_ekf,
     read_motion,
     read_slip_ekf,
     read_start,
     write_belief,
     write_estimate,
+    write_gyro_ekf,
     write_motion,
     write_observer,
     write_slip_ekf,
@@ -45,6 +47,7 @@ from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.numerics.rows import replacing, writer
 from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.estimator import Estimate
+from tlf_env.onboard.gyro_estimator import gyro_for_fixes
 from tlf_env.onboard.slip_estimator import for_fixes
 from tlf_env.physics.vehicle import Mass, Motion, laden
 from tlf_env.physics.world import gap_to_walls
@@ -138,6 +141,8 @@ def equip(arrays: Arrays, lane: int, robot: int, settings: Settings) -> None:
     every, _ = fix_timing(arrays, lane, robot, settings.dt)
     ekf = read_slip_ekf(arrays.constants, robot, lane)
     write_slip_ekf(arrays.constants, robot, lane, for_fixes(ekf, every))
+    gyro_ekf = read_gyro_ekf(arrays.constants, robot, lane)
+    write_gyro_ekf(arrays.constants, robot, lane, gyro_for_fixes(gyro_ekf, every))
 
 
 @law

@@ -60,6 +60,7 @@ from tlf_env.engine.sensors import (
     measured_fix,
     missing,
     sense_robot,
+    sense_with_gyro,
     with_outlier,
 )
 from tlf_env.engine.settings import Settings
@@ -77,6 +78,7 @@ from tlf_env.engine.substeps import (
 )
 from tlf_env.numerics.compiled import allocating, block, law, view
 from tlf_env.numerics.rows import replacing
+from tlf_env.onboard.kinds import EKF_GYRO
 from tlf_env.onboard.speed_observer import observed_speeds
 from tlf_env.physics.vehicle import Push, advance_pose, follow_wheels, roll, slide
 from tlf_env.task.actions import TORQUE
@@ -104,6 +106,7 @@ speed_observer_of = tile_reader("speed_observer")
 loop_of = tile_reader("wheel_loop")
 ekf_of = tile_reader("ekf")
 slip_ekf_of = tile_reader("slip_ekf")
+gyro_ekf_of = tile_reader("gyro_ekf")
 effects_of = tile_reader("effects")
 motion_of, set_motion = tile_access("motion")
 contact_of, set_contact = tile_access("contact")
@@ -115,6 +118,7 @@ fix_of, set_fix = tile_access("fix")
 yaw_rate_of, set_yaw_rate = tile_access("yaw_rate")
 estimate_of, set_estimate = tile_access("estimate")
 slip_of, set_slip = tile_access("slip")
+gyro_of, set_gyro = tile_access("gyro")
 trace_of, set_trace = tile_access("trace")
 set_sample = tile_writer("sample")
 order_of, set_order = tile_access("order")
@@ -506,6 +510,30 @@ def measure(tile: np.ndarray, needs: Needs, dt: float) -> None:
 @law
 def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> None:
     """Wheel speeds and estimators."""
+    if estimator == EKF_GYRO:
+        for i in range(WIDTH):
+            sensors, estimate, slip, found, trace, sample = sense_with_gyro(
+                body_of(tile, i),
+                belief_of(tile, i),
+                gyro_ekf_of(tile, i),
+                reading_of(tile, i),
+                fix_of(tile, i),
+                yaw_rate_of(tile, i),
+                commanded_of(tile, i),
+                sensors_of(tile, i),
+                estimate_of(tile, i),
+                slip_of(tile, i),
+                gyro_of(tile, i),
+                trace_of(tile, i),
+                dt,
+            )
+            set_sensors(tile, i, sensors)
+            set_estimate(tile, i, estimate)
+            set_slip(tile, i, slip)
+            set_gyro(tile, i, found)
+            set_trace(tile, i, trace)
+            set_sample(tile, i, sample)
+        return
     for i in range(WIDTH):
         sensors, estimate, slip, trace, sample = sense_robot(
             body_of(tile, i),

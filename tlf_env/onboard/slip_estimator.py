@@ -99,13 +99,6 @@ class SlipEkf(NamedTuple):
     grip_2: float  # rad per sample squared
     jump_variance: float  # variance of slip per square of a jump of increments, 1/s²
     roughness_weight: float  # weight of a sample in the roughness
-    # of the filter with a gyro only
-    slip_weight: float  # weight of a sample in δ₁ and δ₂
-    reported_1: float  # bounds of δ₁ (mm/s) and δ₂ (rad/s)
-    reported_2: float
-    by_torque: float  # change of the motion in a sample, mm per mN·mm
-    by_wheels: float  # share of a change of the wheels' motion
-    to_encoders: float  # share by which the motion returns to that of the encoders
 
 
 class SlipEstimate(NamedTuple):
@@ -133,13 +126,6 @@ class SlipEstimate(NamedTuple):
     spin_2: float
     roughness_1: float  # mean square of their usual changes, mostly encoder noise
     roughness_2: float
-    # of the filter with a gyro only
-    speed_error: float  # what the speed from the torques is too small, mm/s
-    gyro_error: float  # what the gyro reads too little, rad/s
-    slip_1: float  # δ₁ and δ₂ before their bounds, mm/s and rad/s
-    slip_2: float
-    rolled: float  # last increment of the encoders, mm
-    advance: float  # last increment from the torques, mm
 
 
 def sample_weight(dt_s: float, time_s: float) -> float:
@@ -179,12 +165,6 @@ def slip_ekf_constants(parameters: SlipEkfParameters, dt_s: float) -> SlipEkf:
         grip_2=parameters.yaw_grip_rad_s2 * dt_s**2,
         jump_variance=(parameters.jump_uncertainty / dt_s) ** 2,
         roughness_weight=sample_weight(dt_s, ROUGHNESS_TIME_S),
-        slip_weight=0.0,
-        reported_1=0.0,
-        reported_2=0.0,
-        by_torque=0.0,
-        by_wheels=0.0,
-        to_encoders=0.0,
     )
 
 
