@@ -28,6 +28,7 @@ from baselines.console import (
     whole_numbers,
     writable_folder,
 )
+from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
@@ -68,13 +69,15 @@ def run(
     gains: Annotated[
         str | None,
         typer.Option(
-            help="Gains of the reference: consistent (default), printed, tuned, FILE.yaml."
+            help="Gains of the reference: linearised (default), tuned, consistent and printed (the paper's), "
+            "FILE.yaml."
         ),
     ] = None,
     estimator: Annotated[
         str | None,
         typer.Option(
-            help="ekf (the paper's), ekf-slip, ekf-gyro, truth (the true pose and slip), or module:factory."
+            help="ekf-gyro (default), ekf-slip, ekf (the paper's), truth (the true pose and slip), or "
+            "module:factory."
         ),
     ] = None,
     wheel_loop: Annotated[str | None, typer.Option(help="Own wheel loop, module:factory.")] = None,
@@ -189,7 +192,7 @@ def named_policy(policy: str, gains: str | None) -> str:
         for gains with another policy.
     """
     if policy == "reference":
-        return f"reference:{gains or 'consistent'}"
+        return f"reference:{gains or DEFAULT_CONTROLLER}"
     if gains is not None:
         raise ValueError(f"--gains {gains} needs --policy reference, got {policy!r}")
     return policy
@@ -304,7 +307,7 @@ def bench(
     ctx: typer.Context,
     policies: Annotated[
         str, typer.Option(help="Names as in `tlf run --policy`, comma-separated.")
-    ] = "reference:consistent,reference:printed,pure_pursuit,feedback_linearisation",
+    ] = "reference:linearised,reference:consistent,reference:printed,pure_pursuit,feedback_linearisation",
     tasks: Annotated[str, typer.Option(help="Scenarios, comma-separated.")] = "infinity,flower",
     disturbances: Annotated[
         str, typer.Option(help="Disturbances, comma-separated: presets or FILE.yaml; or all.")

@@ -62,8 +62,10 @@ class ComplementaryFilter:
 def main(horizon_s: float = 100.0, seed: int = 0) -> None:
     """Run the ∞ with the EKF and with the filter above."""
     for estimator in ("ekf", f"{__name__}:ComplementaryFilter"):
-        scenario = load_scenario("infinity", estimator=estimator, horizon_s=horizon_s)
-        record = run_policy(scenario, ReferencePolicy(), seed)
+        scenario = load_scenario(
+            "infinity", estimator=estimator, broadcast_smoothing_s=0.0, horizon_s=horizon_s
+        )
+        record = run_policy(scenario, ReferencePolicy("consistent"), seed)
         errors = [f"{robot.position_rmse_mm:.2f}" for robot in record.metrics()]
         print(f"{estimator}: position error {', '.join(errors)} mm RMS")
 

@@ -49,10 +49,16 @@ class DelayLine:
 
 
 def main(horizon_s: float = 100.0, seed: int = 0) -> None:
-    """Run the ∞ with the paper's observer and with the delay line."""
+    """Run the ∞ with the paper's observer and with the delay line, on the paper's controller and filter."""
     for name, observer in (("paper", None), ("delay line", f"{__name__}:DelayLine")):
-        scenario = load_scenario("infinity", observer=observer, horizon_s=horizon_s)
-        robots = run_policy(scenario, ReferencePolicy(), seed).metrics()
+        scenario = load_scenario(
+            "infinity",
+            observer=observer,
+            estimator="ekf",
+            broadcast_smoothing_s=0.0,
+            horizon_s=horizon_s,
+        )
+        robots = run_policy(scenario, ReferencePolicy("consistent"), seed).metrics()
         errors = [f"{robot.position_rmse_mm:.2f}" for robot in robots]
         print(f"{name:10s}: position error {', '.join(errors)} mm RMS")
 

@@ -57,7 +57,7 @@ class PurePursuit:
 
 
 def main(horizon_s: float = 100.0, seed: int = 0) -> None:
-    """Run the ∞ and the flower with the paper's law and with pure pursuit."""
+    """Run the ∞ and the flower with the default controller and with pure pursuit."""
     for task in ("infinity", "flower"):
         scenario = load_scenario(task, horizon_s=horizon_s)
         for policy in (ReferencePolicy(), PurePursuit()):

@@ -40,6 +40,7 @@ def scenario(start_s: float) -> dict[str, Any]:
         "horizon_s": HORIZON_S,
         "lost_beyond_mm": 3000.0,  # while it waits, its reference goes on
         "estimator": "ekf-slip",
+        "broadcast_smoothing_s": 0.0,
         "world": {"moving": [person]},
     }
 

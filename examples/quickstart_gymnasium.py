@@ -1,6 +1,6 @@
-"""The Gymnasium API in one loop: one robot learns, the paper's controller drives the others.
+"""The Gymnasium API in one loop: one robot learns, the default controller drives the others.
 
-The learner is the first follower. Its action is a *residual*: it is added to the twist of the reference
+The learner is the first follower. Its action is a *residual*: it is added to the twist of the default
 controller. An action of zero gives the reference itself; random actions show the effect of a bad policy.
 
     python examples/quickstart_gymnasium.py --horizon-s 30

@@ -14,7 +14,7 @@ from baselines import ReferencePolicy
 
 
 def main(horizon_s: float = 30.0, seed: int = 0) -> None:
-    """Run the paper's controller to the end of an episode and print the error of each robot."""
+    """Run the default controller to the end of an episode and print the error of each robot."""
     env = tlf_env.parallel_env("infinity", horizon_s=horizon_s)
     policy = ReferencePolicy()
     observations, infos = env.reset(seed=seed)

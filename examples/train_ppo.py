@@ -69,8 +69,6 @@ def main(
         "infinity",
         disturbance=disturbance,
         action="residual",
-        residual_base="tuned",
-        estimator="ekf-slip",
         horizon_s=horizon_s,
     )
     torch.set_num_threads(1)  # the network is small

@@ -162,6 +162,7 @@ def drive(
         "infinity",
         disturbance=channels,
         estimator=estimator,
+        broadcast_smoothing_s=0.0,
         start_ramp_s=4.0,
         horizon_s=horizon_s,
         end_on=(),

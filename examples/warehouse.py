@@ -26,6 +26,7 @@ PALLET = Pushable.model_validate(
         "floor_friction": 0.01,
     }
 )
+FILTER = {"estimator": "ekf-slip", "broadcast_smoothing_s": 0.0}  # of the controller `tuned`
 
 
 def drive(env: FormationParallelEnv) -> tuple[np.ndarray, np.ndarray, list[str]]:
@@ -71,7 +72,7 @@ def clearance(world: World, kind: type, centres: np.ndarray, radius_mm: float) -
 
 def main(horizon_s: float = 25.0) -> None:
     """Print the clearances, and where a pallet goes that stands in the way."""
-    env = tlf_env.parallel_env("warehouse", estimator="ekf-slip", horizon_s=horizon_s)
+    env = tlf_env.parallel_env("warehouse", **FILTER, horizon_s=horizon_s)
     world, radius_mm = env.scenario.world, env.scenario.robot.outline_radius_mm
     centres, to_pallets, touched = drive(env)
     print("         smallest clearance in mm from")
@@ -83,7 +84,7 @@ def main(horizon_s: float = 25.0) -> None:
         print(f"robot_{i}{walls:7.0f}{shelves:9.0f}{to_pallets[i]:9.0f}  {what}")
 
     world = world.model_copy(update={"pushables": (*world.pushables, PALLET)})
-    env = tlf_env.parallel_env("warehouse", estimator="ekf-slip", horizon_s=horizon_s, world=world)
+    env = tlf_env.parallel_env("warehouse", **FILTER, horizon_s=horizon_s, world=world)
     *_, touched = drive(env)
     pallet = env.pushable_bodies[-1]
     way = pallet.position - (PALLET.x_mm, PALLET.y_mm)

@@ -130,7 +130,7 @@ class Run:
 
     def __init__(self, formation, seconds=3.0, actions=None):
         a, scenario = formation.arrays, formation.scenario
-        policy, rows = ReferencePolicy(), []
+        policy, rows = ReferencePolicy(preview_s=scenario.preview_s), []
         self.starts = a.rows("start")[:, :, 0].T.copy()
         for k in range(round(seconds / scenario.control_period_s)):
             seen = a.observations[0].copy()

@@ -24,6 +24,8 @@ untimed = settings(deadline=None)
 
 LOST_RMS_MM = 100.0
 SETTLED_FROM, TAIL_FROM = 0.4, 0.7  # fractions of a run
+# The paper's filter and broadcasts, for tests with numbers of the paper's controller.
+PAPERS: dict[str, Any] = {"estimator": "ekf", "broadcast_smoothing_s": 0.0}
 
 
 @dataclass(frozen=True)
@@ -82,8 +84,8 @@ def drive(
     seed: int = 0,
     **overrides: Any,
 ) -> Run:
-    """Run the reference controller over the whole horizon, whatever happens on the way."""
-    env = tlf_env.parallel_env(scenario, end_on=(), **overrides)
+    """Run a reference controller over the whole horizon; the filter is the paper's if none is named."""
+    env = tlf_env.parallel_env(scenario, end_on=(), **PAPERS | overrides)
     policy = ReferencePolicy(gains)
     observations, infos = env.reset(seed=seed)
     rows = [infos]

@@ -5,6 +5,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import PAPERS
 from stack_policy import StackPolicy
 
 import tlf_env
@@ -17,10 +18,14 @@ from tlf_env.task.info import EndReason
 from tlf_env.task.scenario import load_scenario
 
 DISTURBANCES = preset_names("disturbance")
-POLICY = ReferencePolicy()
+POLICY = ReferencePolicy("consistent")  # keeps no distance: neighbours touch
 SHORT: dict[str, Any] = {"time_gap_s": 1.0, "horizon_s": 4.0, "end_on": ()}
 # Neighbours a few millimetres apart, on a floor that slips: half of the seeds touch at once.
-CROWDED: dict[str, Any] = {"disturbance": "slip", "start_spacing_mm": 250.0}
+CROWDED: dict[str, Any] = {
+    "disturbance": "slip",
+    "start_spacing_mm": 250.0,
+    **PAPERS,
+}
 
 
 def acted(plant: BatchPlant) -> np.ndarray:
@@ -403,6 +408,7 @@ def test_a_policy_with_a_memory_runs_side_by_side():
         observation="sensor",
         action="torque",
         control_period_s=0.001,
+        estimator="ekf",
         horizon_s=0.5,
     )
     records = run_seeds(scenario, StackPolicy(scenario), (0, 1))

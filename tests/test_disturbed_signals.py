@@ -190,6 +190,7 @@ def test_a_follower_goes_on_from_the_last_message_that_arrived(dropout):
         dtype="float64",
         time_gap_s=1.0,
         preview_s=(),
+        broadcast_smoothing_s=0.0,
     )
     first = [*SENSOR_TAIL_ENTRIES].index("message_x") - len(SENSOR_TAIL_ENTRIES)
     scale = found.formation.arrays.sensor_scales[[first, first + 1]]

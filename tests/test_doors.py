@@ -85,7 +85,7 @@ def recorded(case: Case) -> Episode:
     """The episode in the parallel environment."""
     env = tlf_env.parallel_env("infinity", **SHORT | case.fields)
     observations, infos = env.reset(seed=SEED, options=case.options)
-    policy, rng = ReferencePolicy("consistent"), np.random.default_rng(0)
+    rng, policy = np.random.default_rng(0), ReferencePolicy(preview_s=env.scenario.preview_s)
     steps, actions = [Step(rows(observations), list(infos.values()))], []
     dtype = env.action_space("robot_0").dtype
     while env.agents:
@@ -304,7 +304,7 @@ def test_the_command_line(given, tmp_path, monkeypatch):
     summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
     assert summary["reset_options"] == options
     env = tlf_env.parallel_env("infinity", disturbance="combined-hard", horizon_s=10.0, end_on=())
-    policy = ReferencePolicy("consistent")
+    policy = ReferencePolicy()
     observations, infos = env.reset(seed=SEED, options=options)
     steps = [infos]
     while env.agents:

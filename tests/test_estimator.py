@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 import pytest
-from helpers import untimed
+from helpers import PAPERS, untimed
 from hypothesis import given
 from hypothesis import strategies as st
 from page_tables import numbers_in, rows_of
@@ -266,9 +266,9 @@ class Signals:
 
     def __init__(self, seed: int, **overrides: object) -> None:
         env = tlf_env.parallel_env(
-            "infinity", robots=1, control_period_s=0.001, end_on=(), **overrides
+            "infinity", robots=1, control_period_s=0.001, end_on=(), **PAPERS | overrides
         )
-        policy = ReferencePolicy()
+        policy = ReferencePolicy("consistent")
         observation = env.reset(seed=seed)[0]["robot_0"]
         steps = env.scenario.horizon_steps
         axes = [Tracking._fields.index(f"innovation_{axis}") for axis in ("forward", "right")]

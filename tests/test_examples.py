@@ -11,6 +11,7 @@ from types import ModuleType
 
 import numpy as np
 import pytest
+from helpers import PAPERS
 
 import tlf_env
 from baselines import ReferencePolicy, load_policy
@@ -118,7 +119,7 @@ def test_training_runs_and_saves(
     out = tmp_path / "follower.safetensors"
     example.main(robot_steps=400, formations=4, horizon_s=5.0, out=out)
     assert "reference" in capsys.readouterr().out
-    assert load_policy(out).card.residual_base == "tuned"
+    assert load_policy(out).card.residual_base == "linearised"
 
 
 # What the parts of the examples are worth, on the whole task
@@ -135,9 +136,9 @@ def test_training_runs_and_saves(
 )
 @pytest.mark.slow
 def test_the_parts_hold_the_infinity(example: ModuleType, role: str, part: str) -> None:
-    env = tlf_env.parallel_env("infinity", **{role: getattr(example, part)})
+    env = tlf_env.parallel_env("infinity", **PAPERS | {role: getattr(example, part)})
     seen, _ = env.reset(seed=0)
-    policy, errors = ReferencePolicy(), []
+    policy, errors = ReferencePolicy("consistent"), []
     while env.agents:
         actions = {agent: policy.predict(row)[0] for agent, row in seen.items()}
         seen, *_, infos = env.step(actions)

@@ -70,6 +70,7 @@ def test_a_policy_made_for_three_robots_drives_ten() -> None:
             observation="sensor",
             action="torque",
             control_period_s=0.001,
+            estimator="ekf",
             end_on=(),
         )
 

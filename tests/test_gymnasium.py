@@ -345,7 +345,7 @@ def test_wrappers_see_what_they_expect() -> None:
 def test_the_reference_among_others_is_the_reference_policy_bitwise(
     learner: str, options: dict[str, Any]
 ) -> None:
-    policy = ReferencePolicy(options.get("residual_base", "consistent"))
+    policy = ReferencePolicy(options.get("residual_base", "linearised"))
     alone = FormationEnv("infinity", learner=learner, others="reference", **options)
     together = tlf_env.parallel_env("infinity", **options)
     seen, info = alone.reset(seed=2)

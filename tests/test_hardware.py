@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import PAPERS
 
 import tlf_env
 from baselines import ReferencePolicy
@@ -269,8 +270,13 @@ def test_at_level_zero_a_run_is_nominal(preset):
     if preset != "fixes-outage":  # its time is drawn
         acting = driven(disturbance=preset)
         assert (acting[1] != sensed).any()
-        # No built-in estimator has a gyro.
-        assert (acting[0] != states).any() == (preset != "gyro")
+        assert (acting[0] != states).any()
+
+
+def test_the_papers_filter_does_not_read_the_gyro():
+    nominal, bent = (driven(disturbance=name, **PAPERS) for name in ("nominal", "gyro"))
+    assert (bent[1] != nominal[1]).any()
+    assert (bent[0] == nominal[0]).all()
 
 
 def test_the_scenario_is_the_infinity_with_hardware():

@@ -363,7 +363,7 @@ def test_a_policy_that_does_not_fit_is_reported_with_both_values(fields, said, t
     ("fields", "said"),
     [
         ({"residual_base": "consistent"}, "with residual_base 'printed', the scenario has 'consi"),
-        ({"estimator": "truth"}, "with estimator 'ekf', the scenario has 'truth'"),
+        ({"estimator": "truth"}, "with estimator 'ekf-gyro', the scenario has 'truth'"),
         ({"action": "twist"}, "with action 'residual', the scenario has 'twist'"),
     ],
 )
@@ -413,11 +413,30 @@ def test_a_policy_gets_the_fields_that_it_asks_for_if_they_are_not_set(tmp_path)
     assert fit_policy("pure_pursuit", TWIST)[1:] == (TWIST, {})
 
 
+def test_a_policy_asks_for_the_broadcasts_of_its_training(tmp_path):
+    papers = load_scenario(TWIST, estimator="ekf", broadcast_smoothing_s=0.0)
+    path = written(tmp_path, scenario=papers)
+    asked = {"estimator": "ekf", "broadcast_smoothing_s": 0.0}
+    assert fit_policy(str(path), TWIST).overrides == asked
+    change_card(path, lambda card: {k: v for k, v in card.items() if k != "broadcast_smoothing_s"})
+    assert (
+        fit_policy(str(path), TWIST).overrides == asked
+    )  # a card from before there was this field
+    usual = written(tmp_path, scenario=load_scenario(TWIST, estimator="ekf"))
+    assert fit_policy(str(usual), TWIST).overrides == {"estimator": "ekf"}
+
+
+@pytest.mark.parametrize("name", ["residual", "direct"])
+def test_the_shipped_policies_run_on_the_filter_of_their_training(name):
+    scenario = fit_policy(name, TWIST).scenario
+    assert (scenario.estimator, scenario.broadcast_smoothing_s) == ("ekf-slip", 0.0)
+
+
 def test_a_card_names_no_code_that_is_run(tmp_path):
     path = written(tmp_path, scenario=RESIDUAL)
     change_card(path, lambda card: card | {"estimator": "os:system"})
     assert "estimator" not in load_policy(path).scenario_overrides
-    with pytest.raises(ValueError, match="estimator 'os:system', the scenario has 'ekf'"):
+    with pytest.raises(ValueError, match="estimator 'os:system', the scenario has 'ekf-gyro'"):
         fit_policy(str(path), TWIST)
 
 
@@ -471,7 +490,7 @@ def test_a_policy_with_another_action_gets_the_same_draws(tmp_path):
     needs = load_scenario(scenario, action="residual")
     fitted = fit_policy(str(written(tmp_path, scenario=needs, tensors=still)), scenario)
     mine = run_policy(fitted.scenario, fitted.policy, 20_000)
-    reference = run_policy(scenario, make_policy("reference:consistent", scenario), 20_000)
+    reference = run_policy(scenario, make_policy("reference", scenario), 20_000)
     np.testing.assert_array_equal(mine["x_mm"][0], reference["x_mm"][0])
     np.testing.assert_allclose(mine["x_mm"], reference["x_mm"], atol=0.1)
 
@@ -510,7 +529,7 @@ def test_run_gives_a_policy_the_fields_that_it_asks_for_and_reports_them(
     assert end.value.code == 2
     shown = capsys.readouterr().err
     assert "\n" not in shown.strip()
-    assert "with estimator 'ekf', the scenario has 'truth'" in shown
+    assert "with estimator 'ekf-gyro', the scenario has 'truth'" in shown
 
 
 def test_bench_compares_policies_that_act_otherwise(tmp_path, monkeypatch, capsys):
@@ -524,7 +543,8 @@ def test_bench_compares_policies_that_act_otherwise(tmp_path, monkeypatch, capsy
     capsys.readouterr()
     lines = [json.loads(line) for line in (tmp_path / "out/runs.jsonl").read_text().splitlines()]
     asked = {"action": "residual", "residual_base": "printed"}
-    assert [line["overrides"] for line in lines] == [{}, asked]
+    papers = {"estimator": "ekf", "broadcast_smoothing_s": 0.0}
+    assert [line["overrides"] for line in lines] == [papers, asked]
     assert lines[0]["scenario_hash"] != lines[1]["scenario_hash"]
     table = (tmp_path / "out/leaderboard.md").read_text()
     assert "policy.safetensors (action residual; residual_base printed)" in table

@@ -185,7 +185,12 @@ def test_messages_arrive_exactly_one_gap_late(gap_s):
 
     def run(disturbed: bool):
         env = tlf_env.parallel_env(
-            "infinity", disturbance="none", time_gap_s=gap_s, end_on=(), plant="kinematic"
+            "infinity",
+            disturbance="none",
+            time_gap_s=gap_s,
+            broadcast_smoothing_s=0.0,
+            end_on=(),
+            plant="kinematic",
         )
         env.reset(seed=0)
         calm = {**alike(env), "robot_0": np.array([0.2, 0.0], dtype=np.float32)}

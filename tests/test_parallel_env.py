@@ -343,7 +343,7 @@ def test_a_pickled_environment_goes_on_with_the_same_numbers(steps):
 
 def test_position_fixes_carry_white_noise_of_the_stated_variance():
     """A robot at rest knows its place, so its innovations are the noise."""
-    env = make(control_period_s=0.001, horizon_s=10.0)
+    env = make(control_period_s=0.001, horizon_s=10.0, estimator="ekf")
     nis = np.array(
         [
             [info["innovation_nis"] for info in step[4].values()]

@@ -15,6 +15,7 @@ import gymnasium
 import numpy as np
 import pytest
 import yaml
+from helpers import PAPERS
 
 import tlf_env
 from baselines import ReferencePolicy
@@ -182,7 +183,7 @@ def test_the_papers_parts_in_python_are_the_built_in_ones(
     # In float64: a float32 observation would round 1e-12 mm up to 1e-5 mm.
     built_in, plain = (
         tlf_env.parallel_env(task, disturbance=disturbance, end_on=(), dtype="float64", **given)
-        for given in ({}, parts)
+        for given in (PAPERS, PAPERS | parts)
     )
     a, b = (drive(env, seconds=5.0) for env in (built_in, plain))
     assert np.abs(a - a[0]).max() > 30.0  # mm: they drive
@@ -256,7 +257,7 @@ def test_gymnasium_takes_parts_too() -> None:
     env.reset(seed=0)
     for _ in range(10):
         *_, info = env.step(np.zeros(2, np.float32))
-    reference = gymnasium.make("tlf_env/Infinity-v0", action="residual")
+    reference = gymnasium.make("tlf_env/Infinity-v0", action="residual", estimator="ekf")
     reference.reset(seed=0)
     for _ in range(10):
         *_, expected = reference.step(np.zeros(2, np.float32))

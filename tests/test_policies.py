@@ -8,6 +8,7 @@ import pytest
 from helpers import installed
 from stack_policy import StackPolicy
 
+from baselines import ReferencePolicy
 from baselines.cli import main
 from baselines.policies.registry import (
     describe_overrides,
@@ -92,24 +93,51 @@ def test_an_unknown_name_is_reported(name):
 def test_the_tuned_reference_runs_on_an_estimate_of_the_slip():
     assert "reference:tuned" in policy_names()
     fitted = fit_policy("reference:tuned", SCENARIO)
-    assert fitted.overrides == {"estimator": "ekf-slip"}
-    assert fitted.scenario == load_scenario(SCENARIO, estimator="ekf-slip")
-    for name in ("reference", "reference:printed"):
-        assert fit_policy(name, SCENARIO).overrides == {}
+    asked = {"estimator": "ekf-slip", "broadcast_smoothing_s": 0.0}
+    assert fitted.overrides == asked
+    assert fitted.scenario == load_scenario(SCENARIO, **asked)
+
+
+def test_the_default_is_the_linearising_controller_on_the_scenarios_estimator():
+    alone, named = (fit_policy(one, SCENARIO) for one in ("reference", "reference:linearised"))
+    assert alone.policy.controller == named.policy.controller == ReferencePolicy().controller
+    assert alone.policy.controller == controller(SCENARIO.residual_base)
+    assert alone.overrides == named.overrides == {}
+    assert (SCENARIO.estimator, SCENARIO.smoothing_s) == ("ekf-gyro", 0.1)
+
+
+@pytest.mark.parametrize("gains", ["consistent", "printed"])
+def test_the_papers_gains_run_on_the_papers_filter(gains):
+    asked = {"estimator": "ekf", "broadcast_smoothing_s": 0.0}
+    assert fit_policy(f"reference:{gains}", SCENARIO).overrides == asked
+
+
+def test_the_default_drives_without_previews():
+    """It goes without its lead, which is computed from the first preview."""
+    blind = load_scenario(SCENARIO, preview_s=())
+    policy = fit_policy("reference", blind).policy
+    assert policy.controller == controller("linearised").model_copy(update={"lead_s": 0.0})
+    assert blind.base_controller == policy.controller
+    assert np.isfinite(run_policy(blind, policy)["x_mm"]).all()
+    with pytest.raises(ValueError, match=r"lead_s 0\.02 needs a first preview above 0"):
+        fit_policy("reference:tuned", blind)
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "truth", "ekf-slip", "ekf-gyro"])
 def test_an_estimator_that_is_set_is_kept(estimator):
     fitted = fit_policy("reference:tuned", load_scenario(horizon_s=0.2, estimator=estimator))
-    assert (fitted.overrides, fitted.scenario.estimator) == ({}, estimator)
+    assert fitted.overrides == {"broadcast_smoothing_s": 0.0}
+    assert fitted.scenario.estimator == estimator
 
 
 @pytest.mark.parametrize(
     ("text", "overrides"),
     [
         ("controller: {gains: {k_1_per_s: 0.4}}", {}),
-        ("controller: tuned", {"estimator": "ekf-slip"}),
-        ("controller: tuned\nestimator: ekf", {}),
+        ("controller: tuned", {}),
+        ("controller: tuned\nestimator: ekf-gyro", {}),
+        ("controller: tuned\nestimator: ekf", {"estimator": "ekf"}),
+        ("controller: tuned\nbroadcast_smoothing_s: 0", {"broadcast_smoothing_s": 0.0}),
         ("controller: consistent\nestimator: truth\nfound: {by: hand}", {"estimator": "truth"}),
     ],
 )
@@ -187,9 +215,16 @@ class AlwaysStill:
         return np.zeros((len(observation), 2)), state
 
 
+FOR_THE_STACK = {
+    "observation": "sensor",
+    "action": "torque",
+    "control_period_s": 0.001,
+    "estimator": "ekf",
+}
+
+
 def test_the_stack_has_the_papers_law_alone():
-    fields = {"observation": "sensor", "action": "torque", "control_period_s": 0.001}
-    scenario = load_scenario(**fields)
+    scenario = load_scenario(**FOR_THE_STACK)
     with pytest.raises(ValueError, match=r"gains consistent, printed; 'tuned' needs limits"):
         StackPolicy(scenario, "tuned")
     with pytest.raises(
@@ -210,18 +245,12 @@ def test_the_stack_has_the_papers_law_alone():
     ],
 )
 def test_the_stack_refuses_what_would_drive_another_way_than_on_board(fields, message):
-    fitting = {"observation": "sensor", "action": "torque", "control_period_s": 0.001}
     with pytest.raises(ValueError, match=message):
-        StackPolicy(load_scenario(**{**fitting, **fields}))
+        StackPolicy(load_scenario(**{**FOR_THE_STACK, **fields}))
 
 
 def test_a_stack_of_unlike_robots_needs_a_row_for_each():
-    scenario = load_scenario(
-        robots=[{}, {"wheel_radius_mm": 55}],
-        observation="sensor",
-        action="torque",
-        control_period_s=0.001,
-    )
+    scenario = load_scenario(robots=[{}, {"wheel_radius_mm": 55}], **FOR_THE_STACK)
     rows = np.zeros((3, len(sensor_entries(1))))
     with pytest.raises(ValueError, match=r"3 rows; the scenario's 2 robots differ"):
         StackPolicy(scenario).predict(rows)
@@ -348,7 +377,7 @@ def test_a_run_notes_the_start_at_speed_once_and_beside_the_result(
     main()
     shown = capsys.readouterr()
     assert shown.err.count("tlf: note: the reference starts at 559 mm/s") == 1
-    assert "559" not in shown.out
+    assert "559 mm/s" not in shown.out
     if as_json:
         json.loads(shown.out)
 

@@ -169,7 +169,7 @@ def test_it_asks_for_its_previews_and_keeps_those_that_are_set():
     assert alone.overrides == {"preview_s": list(PREVIEW_S)}
     assert len(alone.policy.intervals_s) == len(PREVIEW_S)
     own = fit_policy("nmpc+ekf+none", load_scenario(preview_s=(0.2, 0.6)))
-    assert own.overrides == {}
+    assert own.overrides == {"estimator": "ekf", "broadcast_smoothing_s": 0.0}
     np.testing.assert_allclose(own.policy.law.intervals_s, [0.2, 0.4])
     assert make_policy("nmpc", load_scenario()).memory_size == 2 * len(DEFAULT_PREVIEW_S)
 

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import PAPERS
 from stack_policy import StackPolicy
 
 import tlf_env
@@ -16,6 +17,12 @@ from tlf_env.task.observation import Tracking, sensor_entries, tracking_entries
 
 X, Y, THETA = (Info._fields.index(name) for name in ("x_mm", "y_mm", "theta_rad"))
 FIX_SD_MM = 0.2**0.5
+FIELDS: dict[str, Any] = {
+    **PAPERS,
+    "control_period_s": 0.001,
+    "disturbance": "none",
+    "end_on": (),
+}
 
 every_dtype = pytest.mark.parametrize(
     ("dtype", "within_mm"), [("float32", 0.01), ("float64", 1e-6)]
@@ -45,12 +52,12 @@ class Driven:
 
 
 def on_board(task: str, **options: Any) -> Driven:
-    options = {"control_period_s": 0.001, "disturbance": "none", "end_on": ()} | options
-    return Driven(tlf_env.parallel_env(task, **options), ReferencePolicy())
+    options = FIELDS | options
+    return Driven(tlf_env.parallel_env(task, **options), ReferencePolicy("consistent"))
 
 
 def in_the_policy(task: str, **options: Any) -> Driven:
-    options = {"control_period_s": 0.001, "disturbance": "none", "end_on": ()} | options
+    options = FIELDS | options
     env = tlf_env.parallel_env(task, action="torque", observation="sensor", **options)
     return Driven(env, StackPolicy(env.scenario))
 
@@ -108,7 +115,7 @@ def test_both_routes_agree_under_noise_too() -> None:
 
 def test_a_stack_starts_anew_where_an_episode_starts() -> None:
     env = tlf_env.parallel_env(
-        "infinity", action="torque", observation="sensor", control_period_s=0.001
+        "infinity", action="torque", observation="sensor", control_period_s=0.001, **PAPERS
     )
     policy = StackPolicy(env.scenario)
     poses, state = [], None
@@ -234,6 +241,7 @@ def test_a_follower_hears_its_predecessor_as_it_was_one_gap_ago() -> None:
         time_gap_s=0.4,
         preview_s=(0.2,),
         end_on=(),
+        **PAPERS,
     )
     seen, infos = env.reset(seed=0)
     said = []  # (pose of the estimate, wheel odometry) of every robot at every step

@@ -95,10 +95,11 @@ def test_any_number_of_seeds_runs_side_by_side(count):
         "infinity", plant="batch", disturbance="slip", horizon_s=0.2, time_gap_s=0.1, preview_s=()
     )
     seeds = range(5, 5 + count)
-    records = list(run_seeds(scenario, ReferencePolicy(), seeds))
+    policy = ReferencePolicy(preview_s=())
+    records = list(run_seeds(scenario, policy, seeds))
     assert [record.seed for record in records] == list(seeds)
     for record in (records[0], records[count // 2], records[-1]):
-        alone = run_policy(scenario, ReferencePolicy(), record.seed)
+        alone = run_policy(scenario, policy, record.seed)
         assert record.metrics() == alone.metrics()
         for name, column in alone.columns.items():
             assert (record[name] == column).all(), name
@@ -173,8 +174,9 @@ def test_a_run_says_what_was_touched(world, by, tmp_path):
 def test_runs_side_by_side_say_what_was_touched_too():
     fields = {**AHEAD, "plant": "batch", "horizon_s": 3.0, "preview_s": (), "robots": 2}
     scenario = load_scenario({**fields, "time_gap_s": 1.0, "world": {"walls": [WALL]}})
-    for record in run_seeds(scenario, ReferencePolicy(), range(3)):
-        alone = run_policy(scenario, ReferencePolicy(), record.seed)
+    policy = ReferencePolicy(preview_s=())
+    for record in run_seeds(scenario, policy, range(3)):
+        alone = run_policy(scenario, policy, record.seed)
         assert record.metrics() == alone.metrics()
         assert record.metrics()[0].touched_by == "wall"
 

@@ -491,12 +491,16 @@ def test_periods_divide_in_spite_of_rounding():
 
 
 def test_a_base_that_needs_a_slip_estimate_says_so():
-    needs = load_scenario("infinity", action="residual", residual_base="tuned")
-    assert any("estimates none" in line for line in scenario_warnings(needs))
-    for fields in ({"estimator": "ekf-slip"}, {"residual_base": "consistent"}):
-        assert not any(
-            "estimates none" in one for one in scenario_warnings(load_scenario(needs, **fields))
-        )
+    def warned(scenario):
+        return any("estimates none" in line for line in scenario_warnings(scenario))
+
+    needs = load_scenario("infinity", action="residual", residual_base="tuned", estimator="ekf")
+    assert warned(needs)
+    assert warned(load_scenario(needs, action="twist"))  # it may drive the others
+    assert warned(load_scenario(action="residual", estimator="ekf"))
+    fields = ({"estimator": "ekf-slip"}, {"estimator": "ekf-gyro"}, {"residual_base": "consistent"})
+    assert not any(warned(load_scenario(needs, **one)) for one in fields)
+    assert not warned(load_scenario("infinity", estimator="ekf"))  # the default drives nothing here
 
 
 # Warnings

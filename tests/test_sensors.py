@@ -262,9 +262,14 @@ def test_a_random_walk_spreads_with_the_root_of_time():
 
 
 def test_a_wrong_radius_turns_a_straight_line():
-    """A left wheel that is believed 1 % larger is commanded slower: yaw rate u₁ (1 − 1/1.01)/L."""
+    """A left wheel that is believed 1 % larger is commanded slower: yaw rate u₁ (1 − 1/1.01)/L.
+
+    The filter has no gyro, which would show it.
+    """
     error = {"calibration": {"radius_left": 1.01}, "position": {"outage": 1.0}}
-    _, states, formation = sampled(2.0, (0.3, 0.0), plant="kinematic", disturbance=error)
+    _, states, formation = sampled(
+        2.0, (0.3, 0.0), plant="kinematic", estimator="ekf", disturbance=error
+    )
     rate = 300.0 * (1 - 1 / 1.01) / (2 * H)
     assert states[-1, 7] == pytest.approx(rate)
     # The robot believes that it drives straight on.
@@ -275,7 +280,9 @@ def test_a_wrong_radius_turns_a_straight_line():
 
 def test_a_wrong_track_turns_by_its_factor():
     error = {"calibration": {"track": 1.02}, "position": {"outage": 1.0}}
-    _, states, formation = sampled(1.0, (0.0, 0.1), plant="kinematic", disturbance=error)
+    _, states, formation = sampled(
+        1.0, (0.0, 0.1), plant="kinematic", estimator="ekf", disturbance=error
+    )
     assert states[-1, 7] == pytest.approx(0.8 * 1.02)
     theta = formation.named("estimate").theta[0]
     true = math.atan2(states[-1, 2], states[-1, 3])

@@ -273,7 +273,11 @@ def test_a_fix_never_raises_the_variance():
 
 def test_the_scenario_sets_the_filters_numbers():
     scenario = load_scenario(
-        "infinity", physics_period_s=0.002, ekf_slip={"fix_variance_mm2": 1.5}, horizon_s=1.0
+        "infinity",
+        physics_period_s=0.002,
+        estimator="ekf-slip",
+        ekf_slip={"fix_variance_mm2": 1.5},
+        horizon_s=1.0,
     )
     expected = slip_ekf_constants(SlipEkfParameters(fix_variance_mm2=1.5), 0.002)
     formation = Formation(scenario)

@@ -1,4 +1,4 @@
-"""Smoothed broadcasts: exact on exact fixes, better than raw ones on noisy fixes, and off by default."""
+"""Smoothed broadcasts: exact on exact fixes, better than raw ones on noisy fixes, on where there is room."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from baselines import ReferencePolicy
-from tlf_env import load_scenario, parallel_env
+from tlf_env import BatchPlant, load_scenario, parallel_env
 from tlf_env.engine.arrays import Arrays
 from tlf_env.numerics.angles import wrap
 
@@ -59,11 +59,52 @@ SLIPPING = {"slip": {"delta_2_rad_s": {"type": "sine", "amplitude": 0.25, "frequ
 AGES = range(40, 200)  # from 0.8 s on
 
 
-def test_it_is_off_by_default():
-    assert load_scenario("infinity").smoothing_steps == 0
-    env = parallel_env("infinity")
+def test_by_default_it_is_a_tenth_of_a_second():
+    usual, given = Driven(2.0), Driven(2.0, broadcast_smoothing_s=HALF_S)
+    assert (usual.arrays.messages == given.arrays.messages).all()
+    assert load_scenario("infinity").smoothing_s == HALF_S
+
+
+def test_without_it_nothing_is_kept():
+    env = parallel_env("infinity", broadcast_smoothing_s=0.0)
     env.reset(seed=0)
     assert env.formation.arrays.ways.shape[1] == 0
+
+
+@pytest.mark.parametrize(
+    ("fields", "steps"),
+    [
+        ({}, 5),
+        ({"control_period_s": 0.04, "preview_s": (0.4,)}, 2),  # 0.1 s, rounded
+        ({"control_period_s": 0.001, "horizon_s": 1.0}, 100),
+        ({"control_period_s": 0.25}, 0),
+        ({"time_gap_s": 1.22}, 5),  # 1 s of preview, 10 + 1 control periods
+        ({"time_gap_s": 1.2}, 4),
+        ({"time_gap_s": 1.04}, 0),
+        ({"time_gap_s": 1.0}, 0),
+        ({"time_gap_s": 1.0, "preview_s": (0.5,)}, 5),
+        ({"time_gap_s": 1.22, "disturbance": {"position": {"delay_s": 0.05}}}, 3),
+    ],
+)
+def test_by_default_it_is_as_long_as_there_is_room(fields, steps):
+    scenario = load_scenario("infinity", **fields)
+    assert scenario.smoothing_steps == steps
+    found_s = scenario.smoothing_s
+    assert found_s == pytest.approx(steps * scenario.control_period_s)
+    assert load_scenario(scenario, broadcast_smoothing_s=found_s).smoothing_steps == steps
+    if 0 < steps < round(0.1 / scenario.control_period_s):
+        longer_s = found_s + scenario.control_period_s
+        with pytest.raises(ValueError, match="makes broadcasts"):
+            load_scenario("infinity", **fields, broadcast_smoothing_s=longer_s)
+
+
+def test_a_batch_has_one_length_for_all_its_formations():
+    late = {"position": {"delay_s": 0.05}}
+    alone = {"time_gap_s": 1.22, "robots": 1}
+    scenarios = [load_scenario(**alone), load_scenario(**alone, disturbance=late)]
+    with pytest.raises(ValueError, match=r"scenario 1: broadcasts are smoothed over ±3 control pe"):
+        BatchPlant(scenarios, 2)
+    assert BatchPlant(scenarios, 2, broadcast_smoothing_s=0.06).scenario.smoothing_steps == 3
 
 
 def test_on_exact_fixes_and_wheels_that_roll_the_message_is_the_truth():

@@ -173,11 +173,16 @@ def test_the_linearised_reference_is_a_system_of_a_textbooks_law():
     """One compiled law, in a controller and behind a limiter: the same bits."""
     name = "feedback_linearisation:bounded+ekf-gyro-smoothed+body"
     alone, system = (fit_policy(one, SCENARIO) for one in ("reference:linearised", name))
-    assert (system.scenario, system.overrides) == (alone.scenario, alone.overrides)
+    assert (alone.overrides, system.overrides) == ({}, {"broadcast_smoothing_s": 0.1})
+    assert alone.scenario.smoothing_s == 0.1
+    assert load_scenario(alone.scenario, broadcast_smoothing_s=0.1) == system.scenario
     found, wanted = (one.policy.predict(rows())[0] for one in (system, alone))
     assert found.tobytes() == wanted.tobytes()
+    first, second = (run_policy(one.scenario, one.policy, 3) for one in (system, alone))
+    for column, values in first.columns.items():
+        np.testing.assert_array_equal(values, second[column], err_msg=column)
     with pytest.raises(ValueError, match="gains and linearisation exclude each other"):
-        Controller(gains={}, linearisation={"ahead_mm": 80.0, "gain_per_s": 1.0})
+        Controller(gains={"k_1_per_s": 0.4}, linearisation={"ahead_mm": 80.0, "gain_per_s": 1.0})
 
 
 def test_a_system_drives_as_its_parts_put_together_by_hand():
@@ -186,7 +191,7 @@ def test_a_system_drives_as_its_parts_put_together_by_hand():
     bounds = ErrorBounds(braking_error_mm=23.0, forward_error_mm=119.0, lateral_error_mm=150.0)
     law = FeedbackLinearisation(ahead_mm=80.0, gain_per_s=1.3, bounds=bounds)
     by_hand = LimitedLaw(law, load_limiter("body"), PERIOD_S, DEFAULT_PREVIEW_S)
-    scenario = load_scenario(SCENARIO, estimator="ekf-slip")
+    scenario = load_scenario(SCENARIO, estimator="ekf-slip", broadcast_smoothing_s=0.0)
     first = run_policy(fitted.scenario, fitted.policy, 3)
     second = run_policy(scenario, by_hand, 3)
     for column, values in first.columns.items():
@@ -247,7 +252,7 @@ def test_a_system_asks_for_its_estimator_with_the_scenarios_filter(tmp_path):
     path = tmp_path / "mine.yaml"
     path.write_text("controller: tuned\nestimator: ekf\nekf_slip: {fix_variance_mm2: 0.7}")
     fitted = fit_policy(f"reference:{path}+ekf-slip+body", SCENARIO)
-    assert fitted.overrides == {"estimator": "ekf-slip"}
+    assert fitted.overrides == {"estimator": "ekf-slip", "broadcast_smoothing_s": 0.0}
     assert fitted.scenario.ekf_slip == SCENARIO.ekf_slip
     assert not fitted.policy.privileged
     assert fit_policy("kanayama+truth", SCENARIO).policy.privileged
@@ -256,7 +261,7 @@ def test_a_system_asks_for_its_estimator_with_the_scenarios_filter(tmp_path):
 
 def test_an_estimator_that_is_set_and_another_that_is_named_are_refused():
     fixed = load_scenario(SCENARIO, estimator="truth")
-    assert fit_policy("kanayama+truth+none", fixed).overrides == {}
+    assert fit_policy("kanayama+truth+none", fixed).overrides == {"broadcast_smoothing_s": 0.0}
     said = r"^system 'kanayama\+ekf\+none' names the estimator 'ekf'; the scenario sets 'truth'$"
     with pytest.raises(ValueError, match=said):
         fit_policy("kanayama+ekf+none", fixed)
@@ -292,15 +297,35 @@ def test_a_batch_is_its_rows():
     np.testing.assert_array_equal(batch, [policy.predict(one)[0] for one in rows()])
 
 
-def test_the_reference_takes_no_gains_by_default():
-    default = make_policy("reference+ekf+none", SCENARIO).predict(rows())[0]
-    assert default.tobytes() == ReferencePolicy("consistent").predict(rows())[0].tobytes()
+@pytest.mark.parametrize("limiter", ["", "+body"])
+def test_the_reference_without_gains_is_the_default_controller(limiter):
+    default = make_policy(f"reference+ekf-gyro{limiter}", SCENARIO).predict(rows())[0]
+    assert default.tobytes() == ReferencePolicy().predict(rows())[0].tobytes()
+
+
+@pytest.mark.parametrize("limiter", ["", "+none"])
+def test_a_law_named_alone_runs_on_the_scenarios_estimator(limiter):
+    """The same filter for every law; a system names another."""
+    assert fit_policy("kanayama", SCENARIO).overrides == {}
+    fitted = fit_policy(f"kanayama+ekf{limiter}", SCENARIO)
+    assert fitted.overrides == {"estimator": "ekf", "broadcast_smoothing_s": 0.0}
+
+
+def test_a_changed_scenario_does_not_count_as_set():
+    """A policy asks for fields that a caller has not set, also of a scenario made from another."""
+    changed = load_scenario(load_scenario("infinity"), horizon_s=2.0)
+    assert fit_policy("kanayama+ekf", changed).scenario.estimator == "ekf"
+    assert fit_policy("reference:consistent", changed).scenario.estimator == "ekf"
+    kept = load_scenario(load_scenario("infinity", estimator="ekf-slip"), horizon_s=2.0)
+    assert fit_policy("reference:consistent", kept).scenario.estimator == "ekf-slip"
 
 
 def test_a_smoothed_estimator_is_the_filter_with_smoothed_broadcasts():
     scenario = fit_policy("kanayama+ekf-gyro-smoothed+body", SCENARIO).scenario
     assert (scenario.estimator, scenario.broadcast_smoothing_s) == ("ekf-gyro", 0.1)
-    assert fit_policy("kanayama+ekf-gyro+body", scenario).scenario == scenario  # as before
+    assert fit_policy("kanayama+ekf-gyro-smoothed+body", scenario).scenario == scenario
+    plain = fit_policy("kanayama+ekf-gyro+body", SCENARIO).scenario
+    assert (plain.estimator, plain.broadcast_smoothing_s) == ("ekf-gyro", 0.0)
     other = load_scenario("infinity", broadcast_smoothing_s=0.2)
     said = r"^system '.*' names the broadcast_smoothing_s 0\.1; the scenario sets 0\.2$"
     with pytest.raises(ValueError, match=said):

@@ -38,9 +38,11 @@ from baselines.benchmark.statistics import (
 )
 from tlf_env.common.files import atomic
 from tlf_env.disturbances.channels import CHANNELS
+from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 
 PROFILE_SCORES = np.linspace(0, 100, 101)
-REFERENCES = ("reference:consistent", "reference")  # the same policy
+# What the others are compared with: the default controller by both its names, or else the paper's.
+REFERENCES = (f"reference:{DEFAULT_CONTROLLER}", "reference", "reference:consistent")
 LOSSES = (0.05, 0.5)
 
 

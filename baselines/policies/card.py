@@ -52,6 +52,7 @@ class Card(Frozen):
     residual_fade_mm: NonNegative = 0.0  # estimated errors at which the residual counts half
     residual_reach_mm: Positive | None = None
     estimator: Word | None = None  # None: the scenario's
+    broadcast_smoothing_s: NonNegative | None = 0.0  # None: as the scenario finds room for
 
     network: Network
 
@@ -86,7 +87,8 @@ class Card(Frozen):
         """The columns of a scenario's observation that the policy takes, found by name.
 
         The observation may have further entries, in another order, and further previews. The estimator
-        counts only if the action is a residual; other policies run with the scenario's estimator.
+        counts only if the action is a residual; other policies run with the scenario's estimator. Broadcasts
+        may be smoothed or not.
 
         Raises
         ------
@@ -100,6 +102,7 @@ class Card(Frozen):
             theirs["rays"] = None
         if self.action != "residual":
             theirs["estimator"] = self.estimator
+        theirs["broadcast_smoothing_s"] = self.broadcast_smoothing_s
         offered = theirs.pop("entries")
         try:
             for field, value in theirs.items():
@@ -158,6 +161,7 @@ def interface(scenario: Scenario) -> dict[str, Any]:
         "residual_fade_mm": scenario.residual_fade_mm if residual else 0.0,
         "residual_reach_mm": scenario.residual_reach_mm if residual else None,
         "estimator": scenario.estimator,
+        "broadcast_smoothing_s": scenario.broadcast_smoothing_s,
         "observation": scenario.observation,
         "preview_s": previews,
         "rays": scenario.rays,

@@ -106,6 +106,8 @@ class LearnedPolicy:
         card = self.card
         asked: dict[str, Any] = {"action": card.action, "observation": card.observation}
         asked |= {"residual_base": card.residual_base, "estimator": card.estimator}
+        if card.estimator is not None:
+            asked["broadcast_smoothing_s"] = card.broadcast_smoothing_s
         if card.residual_fade_mm:
             asked["residual_fade_mm"] = card.residual_fade_mm
         asked["residual_reach_mm"] = card.residual_reach_mm

@@ -1,4 +1,4 @@
-"""The paper's tracking controller as a policy: a pure function of the ``tracking`` observation."""
+"""The reference controllers as a policy: a pure function of the ``tracking`` observation."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from baselines.policies.columns import find_columns
 from tlf_env.common.presets import is_file_name
 from tlf_env.numerics.compiled import driver
-from tlf_env.onboard.controllers import load_controller
+from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for, load_controller
 from tlf_env.onboard.tracking import (
     Controller,
     ControllerRow,
@@ -30,14 +30,15 @@ def _actions(rows: np.ndarray, scales: np.ndarray, row: ControllerRow, out: np.n
 
 
 class ReferencePolicy:
-    """Eqs (16)–(21) from the observation to a ``twist`` action, with the signature of SB3's ``predict``.
+    """A controller's law and limits, from the observation to a ``twist`` action, as SB3's ``predict``.
 
     Parameters
     ----------
     gains
-        ``"consistent"`` (k₂ = 0.83·k₃), ``"printed"`` (k₂ = 0.83 mm²/s), ``"tuned"`` (other gains,
-        and limits on the twist), the path of a controller file (``.yaml``), :class:`TrackingGains` or
-        :class:`Controller`.
+        A preset or the path of a controller file (``.yaml``), :class:`TrackingGains` or
+        :class:`Controller`. Presets: ``"linearised"``, the default (feedback linearisation behind limits on
+        the twist); the paper's law, eqs (16)–(21), with its gains ``"consistent"`` (k₂ = 0.83·k₃) or
+        ``"printed"`` (k₂ = 0.83 mm²/s); ``"tuned"`` (the paper's law with other gains, and limits).
     control_period_s
         Control period, s; needed for the limits on accelerations.
     preview_s
@@ -46,24 +47,25 @@ class ReferencePolicy:
     Raises
     ------
     ValueError
-        for an unknown preset, an invalid file, and a lead without a first preview above 0.
+        for an unknown preset, an invalid file, and a lead without a first preview above 0; the default
+        controller goes without its lead there.
     """
 
     privileged = False
-    # The estimator of a controller that cancels slip, and the fields that a controller file asks for.
+    # The fields that a preset or a controller file asks for, of the estimator and the broadcasts.
     scenario_overrides: Mapping[str, Any] = {}
 
     def __init__(
         self,
-        gains: str | TrackingGains | Controller = "consistent",
+        gains: str | TrackingGains | Controller = DEFAULT_CONTROLLER,
         control_period_s: float = DEFAULT_CONTROL_PERIOD_S,
         preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S,
     ) -> None:
         self.files: tuple[Path, ...] = ()
         asked: dict[str, Any] = {}
         if isinstance(gains, str):
-            file = load_controller(gains)
-            self.controller, asked = file.controller, file.scenario_overrides
+            self.controller = controller_for(gains, preview_s)
+            asked = load_controller(gains).scenario_overrides
             self.files = (Path(gains),) if is_file_name(gains) else ()
         elif isinstance(gains, TrackingGains):
             self.controller = Controller(gains=gains)
@@ -77,10 +79,9 @@ class ReferencePolicy:
             names += [name for name in tracking_entries(preview_s[:1]) if name not in now]
         entries = tracking_entries(preview_s)
         self._columns = find_columns(names, entries)
+        self._preview_s = tuple(preview_s)
         self._needed = int(self._columns.places.max()) + 1
         self._scales = np.array([entries[name].scale for name in names])
-        if self.controller.limits.cancel_slip:
-            asked = {"estimator": "ekf-slip"} | asked
         self.scenario_overrides = asked
 
     def predict(
@@ -103,8 +104,9 @@ class ReferencePolicy:
         observation = np.asarray(observation)
         if observation.ndim not in (1, 2) or observation.shape[-1] < self._needed:
             raise ValueError(
-                f"the observation has the shape {observation.shape}; a tracking observation has at "
-                f"least {self._needed} entries, in one row or a batch of rows"
+                f"the observation has the shape {observation.shape}; a tracking observation with "
+                f"preview_s {self._preview_s} has at least {self._needed} entries, in one row or a batch "
+                "of rows"
             )
         rows = np.atleast_2d(observation)
         if not self._columns.leading:

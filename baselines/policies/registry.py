@@ -25,6 +25,7 @@ from baselines.policies.systems import (
     system_controllers,
 )
 from tlf_env.common.digest import code_of
+from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 from tlf_env.onboard.parts import Policy, load_part, make_part
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import tracking_entries
@@ -66,12 +67,13 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     Parameters
     ----------
     name
-        ``reference`` or ``reference:GAINS``, where GAINS is a preset or the path of a controller file
-        (``.yaml``), a law of :data:`LAWS` such as ``kanayama`` (each also with ``:PARAMETERS``, a preset or
-        the path of a ``.yaml`` file), a system ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the
-        name of a shipped learned policy, the path of a ``.safetensors`` file (with its card in the same
-        folder), ``module:factory`` of an object with SB3's ``predict``, ``entry:FOLDER`` of a
-        competition's entry, or the path of an SB3 ``.zip`` file.
+        ``reference`` (the default controller) or ``reference:GAINS``, where GAINS is a preset or the path
+        of a controller file (``.yaml``), a law of :data:`LAWS` such as ``kanayama`` (each also with
+        ``:PARAMETERS``, a preset or the path of a ``.yaml`` file), a system
+        ``CONTROLLER+ESTIMATOR+LIMITER`` of such a controller, the name of a shipped learned policy, the
+        path of a ``.safetensors`` file (with its card in the same folder), ``module:factory`` of an object
+        with SB3's ``predict``, ``entry:FOLDER`` of a competition's entry, or the path of an SB3 ``.zip``
+        file.
     trust
         Allow an SB3 ``.zip`` file and an entry's program: both run code that is in them.
 
@@ -203,7 +205,9 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     head, _, tail = name.partition(":")
     if head == "reference" and name != "reference:":
         check_interface(name, scenario, action="twist", observation="tracking")
-        return ReferencePolicy(tail or "consistent", scenario.control_period_s, scenario.preview_s)
+        return ReferencePolicy(
+            tail or DEFAULT_CONTROLLER, scenario.control_period_s, scenario.preview_s
+        )
     if head in LAWS:
         check_interface(name, scenario, action="twist", observation="tracking")
         return make_law(head, tail, scenario)

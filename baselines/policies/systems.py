@@ -23,21 +23,20 @@ from tlf_env.common.presets import (
     read_preset_or_file,
 )
 from tlf_env.numerics.compiled import driver
-from tlf_env.onboard.controllers import controller, controller_names
+from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for, controller_names
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.limiter import TwistLimits
 from tlf_env.onboard.parts import Policy, load_part
 from tlf_env.onboard.spacing import Spacing
 from tlf_env.onboard.tracking import Controller, ControllerRow, controller_row
 from tlf_env.task.actions import ACTION_SIZE, twist_action
-from tlf_env.task.scenario import Scenario
+from tlf_env.task.scenario import BROADCAST_SMOOTHING_S, Scenario
 
 FORM = "CONTROLLER+ESTIMATOR or CONTROLLER+ESTIMATOR+LIMITER"
 ENTRY = "entry:"  # before the folder of a competition's entry
 NOT_LIMITED = (".zip", ".safetensors")  # learned policies, whose paths may contain a +
 
 
-BROADCAST_SMOOTHING_S = 0.1
 SMOOTHED: tuple[EstimatorKind, ...] = ("ekf", "ekf-slip", "ekf-gyro")
 PYTHON_ESTIMATORS = {
     "ukf": "baselines.policies.estimators.unscented:UnscentedEstimator",
@@ -46,7 +45,7 @@ PYTHON_ESTIMATORS = {
 # The fields of the scenario that an estimator's name sets: the filter on board, parameters of it, and what is
 # broadcast of it.
 ESTIMATORS: dict[str, dict[str, Any]] = {
-    **{kind: {"estimator": kind} for kind in ESTIMATOR_KINDS},
+    **{kind: {"estimator": kind, "broadcast_smoothing_s": 0.0} for kind in ESTIMATOR_KINDS},
     **{
         f"{kind}-smoothed": {
             "estimator": kind,
@@ -272,7 +271,7 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
     asked: Mapping[str, Any] = {}
     period_s, preview_s = scenario.control_period_s, scenario.preview_s
     if kind == "controller":
-        law = controller(tail or "consistent")
+        law = controller_for(tail or DEFAULT_CONTROLLER, scenario.preview_s)
         whole = behind(law, own_limiter(law) if limiter is None else limiter)
         policy = ReferencePolicy(whole, period_s, preview_s)
         files += [] if path is None else [path]

@@ -28,6 +28,7 @@ FORMATION_STEPS = (
     25_000  # of all formations in one timing; at least MIN_STEPS and at most `steps` each
 )
 MIN_STEPS = 3
+PAPERS_FILTER: dict[str, Any] = {"estimator": "ekf", "broadcast_smoothing_s": 0.0}
 
 
 @dataclass
@@ -52,13 +53,13 @@ class TimedEnvironment:
 
 
 def single_formation(robots: int, steps: int, scenario: Any = "infinity") -> TimedEnvironment:
-    """The pymunk environment, 20 substeps a step, along a closed-loop run of the reference.
+    """The pymunk environment, 20 substeps a step, along a closed-loop run of the paper's controller and filter.
 
     The reference's actions are recorded first and replayed for the timing. So only the environment is
     timed, on a realistic motion.
     """
-    env = parallel_env(scenario, robots=robots, horizon_s=max(steps, 50) * 0.02)
-    policy = ReferencePolicy()
+    env = parallel_env(scenario, robots=robots, horizon_s=max(steps, 50) * 0.02, **PAPERS_FILTER)
+    policy = ReferencePolicy("consistent")
     observations, _ = env.reset(seed=0)
     recorded: list[dict[str, np.ndarray]] = []
     while env.agents:

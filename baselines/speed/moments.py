@@ -15,7 +15,11 @@ from tlf_env.task.actions import REFERENCE
 THREADS = (1, 2)  # of a vector environment
 SEEDS = 32  # formations that are recorded
 # The reference that drives them, with the estimator that it is tuned for: no robot gets lost.
-DRIVEN: dict[str, Any] = {"residual_base": "tuned", "estimator": "ekf-slip"}
+DRIVEN: dict[str, Any] = {
+    "residual_base": "tuned",
+    "estimator": "ekf-slip",
+    "broadcast_smoothing_s": 0.0,
+}
 BEGUN_STEPS = 1000  # all robots move by then
 MOMENTS = 16
 STEPS_BETWEEN_MOMENTS = 100

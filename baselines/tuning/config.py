@@ -252,7 +252,12 @@ class TuneConfig(Frozen):
         slip = own if self.estimator == "ekf-slip" else None
         try:
             return ControllerFile.model_validate(
-                {"controller": tree, "estimator": self.estimator, "ekf_slip": slip}
+                {
+                    "controller": tree,
+                    "estimator": self.estimator,
+                    "ekf_slip": slip,
+                    "broadcast_smoothing_s": 0.0,
+                }
             )
         except ValidationError as error:
             raise ValueError(one_line(error, ControllerFile)) from error
@@ -290,6 +295,7 @@ class TuneConfig(Frozen):
                     plant="batch",
                     **{
                         "estimator": self.estimator,
+                        "broadcast_smoothing_s": 0.0,
                         "ekf_slip": None if ekf_slip is None else ekf_slip.model_dump(),
                         **asked,
                     },

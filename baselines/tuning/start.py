@@ -21,7 +21,7 @@ from baselines.policies.systems import (
     parse_system,
 )
 from tlf_env.common.errors import one_line
-from tlf_env.onboard.controllers import controller
+from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -145,5 +145,5 @@ def named_start(name: str) -> Named:
             f"start {name!r}: a controller is searched without smoothed broadcasts, and with the parameters "
             f"of {estimator!r} that it finds itself"
         )
-    known = controller(tail or "consistent") if head == "reference" else controller(head)
+    known = controller(tail or DEFAULT_CONTROLLER) if head == "reference" else controller(head)
     return Named(behind(known, limiter or own_limiter(known)), estimator)

@@ -321,7 +321,14 @@ def course(skid: Skid, dt_s: float, make: Make | None) -> np.ndarray:
 
 def closed_loop(trajectory: str, disturbance: Any, plant: str, seed: int) -> Record:
     """A run of the paper's controller."""
-    scenario = load_scenario(trajectory, disturbance=disturbance, plant=plant, horizon_s=RUN_S)
+    scenario = load_scenario(
+        trajectory,
+        disturbance=disturbance,
+        plant=plant,
+        estimator="ekf",
+        broadcast_smoothing_s=0.0,
+        horizon_s=RUN_S,
+    )
     return run_policy(scenario, ReferencePolicy("consistent"), seed)
 
 

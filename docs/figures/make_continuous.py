@@ -23,7 +23,7 @@ from tlf_env.task.scenario import load_scenario
 
 TASKS = {"infinity": "∞", "flower": "flower"}
 DISTURBANCES = ("slip-ramps", "slip-noise", "slip-sines", "slip")
-BEST = "feedback_linearisation:bounded+ekf-gyro-smoothed+body"
+BEST = "reference:linearised"
 ENTRIES = {
     f"`{BEST}`": BEST,
     "`residual`": "residual",

@@ -72,6 +72,7 @@ def measure(case: Case, ratio: float, estimator: str) -> Counts:
         "infinity",
         disturbance=case.disturbance,
         estimator=estimator,
+        broadcast_smoothing_s=0.0,
         horizon_s=HORIZON_S,
         plant="batch",
     )

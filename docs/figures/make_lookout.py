@@ -26,8 +26,8 @@ ENTRIES = (
     "reference:printed",
     "reference:consistent",
     "reference:tuned",
-    "pure_pursuit",
-    "feedback_linearisation",
+    "pure_pursuit+ekf",
+    "feedback_linearisation+ekf",
     "residual",
     "direct",
 )

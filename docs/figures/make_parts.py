@@ -85,7 +85,7 @@ def changed(change: dict[str, Any]) -> ReferencePolicy:
 
 def cell(policy: ReferencePolicy, disturbance: str, fields: dict[str, Any]) -> str:
     """The worst robot's position RMS (mm), median over seeds, and how many runs lost a robot."""
-    fields = {"estimator": "ekf-slip", **fields}
+    fields = {"estimator": "ekf-slip", "broadcast_smoothing_s": 0.0, **fields}
     scenario = load_scenario(
         "infinity", disturbance=disturbance, horizon_s=HORIZON_S, plant="batch", **fields
     )

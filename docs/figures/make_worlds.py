@@ -29,9 +29,9 @@ NAMES = ("corridor", "warehouse", "slalom_posts", "crossing_traffic")
 def record(name: str) -> Record:
     """A run of the reference in a world, cut off when a robot first touches something."""
     with without_warnings():
-        scenario = load_scenario(name)
+        scenario = load_scenario(name, estimator="ekf", broadcast_smoothing_s=0.0)
         scenario = load_scenario(scenario, horizon_s=min(scenario.horizon_s, LAP_S))
-    run = run_policy(scenario, ReferencePolicy(), seed=1)
+    run = run_policy(scenario, ReferencePolicy("consistent"), seed=1)
     rows = run.t_s <= run.touched_at_s.min()
     return replace(
         run,

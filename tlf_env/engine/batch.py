@@ -455,6 +455,11 @@ def _alike(scenarios: list[Scenario]) -> tuple[Scenario, ...]:
                     f"scenario {number}: {field} is {theirs!r}, that of the first {mine!r}; the "
                     f"scenarios of a batch may differ in {', '.join(MAY_DIFFER)}"
                 )
+        if other.smoothing_steps != first.smoothing_steps:
+            raise ValueError(
+                f"scenario {number}: broadcasts are smoothed over ±{other.smoothing_steps} control periods, "
+                f"those of the first over ±{first.smoothing_steps}; set the same broadcast_smoothing_s"
+            )
     return tuple(scenarios)
 
 

@@ -6,7 +6,6 @@ import math
 from typing import NamedTuple
 
 from tlf_env.disturbances.model import changes_within_episode
-from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.kinds import ESTIMATOR_CODES, EXTERNAL
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.rays import Rays
@@ -88,7 +87,7 @@ def make_settings(scenario: Scenario) -> Settings:
         changing=changes_within_episode(scenario.disturbance),
         adversary=scenario.adversary,
         base=controller_row(
-            controller(scenario.residual_base), scenario.control_period_s, scenario.preview_s
+            scenario.base_controller, scenario.control_period_s, scenario.preview_s
         ),
         residual_fade=scenario.residual_fade_mm,
         residual_reach=scenario.residual_reach_mm or math.inf,

@@ -62,9 +62,9 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         The agent that acts, ``"robot_0"`` to ``"robot_{n-1}"``. None: ``robot_1``, or ``robot_0`` in a
         formation of one robot.
     others
-        The policy of the other robots: ``"reference"`` (the tracking law with the gains of
-        ``residual_base``), an object with SB3's ``predict`` from ``tracking`` observations to ``twist``
-        actions, or ``"module:factory"`` of such an object.
+        The policy of the other robots: ``"reference"`` (the controller ``residual_base``), an object with
+        SB3's ``predict`` from ``tracking`` observations to ``twist`` actions, or ``"module:factory"`` of
+        such an object.
     render_mode
         None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, updated by every
         :meth:`reset` and :meth:`step`, at most in real time).

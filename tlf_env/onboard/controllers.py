@@ -14,8 +14,9 @@ from tlf_env.common.presets import is_file_name, preset_names, read_preset_or_fi
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import EstimatorKind
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
-from tlf_env.onboard.tracking import Controller
+from tlf_env.onboard.tracking import Controller, can_lead
 
+DEFAULT_CONTROLLER = "linearised"
 SCENARIO_FIELDS = ("estimator", "ekf_slip", "ekf_gyro", "broadcast_smoothing_s")
 
 
@@ -36,13 +37,17 @@ class ControllerFile(Frozen):
 
     @property
     def scenario_overrides(self) -> dict[str, Any]:
-        """Fields of the scenario that the file sets, of the estimator and the broadcasts; or none."""
+        """Fields of the scenario that the file sets, of the estimator and the broadcasts; or none.
+
+        Parameters of a filter name this filter, if the file names none.
+        """
         given = self.model_dump(include=set(SCENARIO_FIELDS), exclude_none=True)
-        whole = {
-            "ekf_slip": self.ekf_slip,
-            "ekf_gyro": self.ekf_gyro,
-        }  # with their fields that are None
-        return given | {name: part.model_dump() for name, part in whole.items() if part is not None}
+        named = {}
+        for field, kind in (("ekf_slip", "ekf-slip"), ("ekf_gyro", "ekf-gyro")):
+            if field in given:
+                given[field] = getattr(self, field).model_dump()  # with its fields that are None
+                named["estimator"] = kind
+        return named | given
 
 
 def controller_names() -> list[str]:
@@ -78,3 +83,14 @@ def _loaded(source: str | Path) -> ControllerFile:
 def controller(source: str | Path) -> Controller:
     """Gains and limits of a preset or a controller file; errors as in :func:`load_controller`."""
     return load_controller(source).controller
+
+
+def controller_for(source: str | Path, preview_s: tuple[float, ...]) -> Controller:
+    """As :func:`controller`, for an observation with previews (s).
+
+    The default controller can do without its lead, so that it drives observations without previews, too.
+    """
+    found = controller(source)
+    if source == DEFAULT_CONTROLLER and not can_lead(preview_s):
+        return found.model_copy(update={"lead_s": 0.0})
+    return found

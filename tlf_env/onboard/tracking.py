@@ -77,7 +77,7 @@ class Controller(Frozen):
 
     @model_validator(mode="after")
     def _one_law(self) -> Self:
-        if self.linearisation is not None and "gains" in self.model_fields_set:
+        if self.linearisation is not None and self.gains != TrackingGains():
             raise ValueError("gains and linearisation exclude each other: they are of two laws")
         return self
 
@@ -93,6 +93,11 @@ class ControllerRow(NamedTuple):
     lead: float  # fraction of the time to the first preview
 
 
+def can_lead(preview_s: tuple[float, ...]) -> bool:
+    """Whether an observation's previews (s) allow a lead, which is computed from the first."""
+    return bool(preview_s) and preview_s[0] > 0
+
+
 def controller_row(
     controller: Controller, period_s: float, preview_s: tuple[float, ...] = ()
 ) -> ControllerRow:
@@ -103,7 +108,7 @@ def controller_row(
     ValueError
         if there is a lead and no preview above 0.
     """
-    if controller.lead_s and not (preview_s and preview_s[0] > 0):
+    if controller.lead_s and not can_lead(preview_s):
         raise ValueError(
             f"lead_s {controller.lead_s} needs a first preview above 0, got preview_s {preview_s}"
         )

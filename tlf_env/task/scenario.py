@@ -31,7 +31,7 @@ from tlf_env.common.models import (
 )
 from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
-from tlf_env.onboard.controllers import controller
+from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for
 from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
@@ -39,7 +39,7 @@ from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import PART_PATTERN
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
-from tlf_env.onboard.tracking import controller_row
+from tlf_env.onboard.tracking import Controller, controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.physics.world import World
@@ -59,6 +59,7 @@ from tlf_env.task.waypoints import MAX_MAGNITUDE, scenario_of_waypoints
 MAX_ROBOTS = 1000
 DEFAULT_CONTROL_PERIOD_S = 0.02
 DEFAULT_PREVIEW_S = (0.5, 1.0)
+BROADCAST_SMOOTHING_S = 0.1  # by default, where there is room
 SETTLE_FRACTION = 0.4
 START_MARGIN_MM = 1.0  # smallest distance between outlines at the start
 DIVIDES_TOLERANCE = 1e-9
@@ -146,13 +147,14 @@ class Scenario(Frozen):
     world: World = World()
 
     wheel_loop: WheelLoopParameters | PartPath = WheelLoopParameters()
-    estimator: EstimatorKind | PartPath = "ekf"
+    estimator: EstimatorKind | PartPath = "ekf-gyro"
     ekf: EkfParameters = EkfParameters()
     ekf_slip: SlipEkfParameters = SlipEkfParameters()
     ekf_gyro: GyroEkfParameters = GyroEkfParameters()
     # Smoothed broadcasts: a robot sends, beside its pose now, the one of a short time ago, from the position
-    # fixes of this time before and after. 0: only its pose now.
-    broadcast_smoothing_s: NonNegative = 0.0
+    # fixes of this time before and after. 0: only its pose now. None: 0.1 s in whole control periods, or as
+    # many as the time gap leaves room for.
+    broadcast_smoothing_s: NonNegative | None = None
     observer: ObserverParameters | PartPath = ObserverParameters()
 
     disturbance: Disturbance = Disturbance()
@@ -160,7 +162,7 @@ class Scenario(Frozen):
 
     action: ActionKind = "twist"
     # Base controller of the action `residual`, which is added to its twist: a preset or a file.
-    residual_base: str = "consistent"
+    residual_base: str = DEFAULT_CONTROLLER
     # Estimated errors at which a residual has half its weight: the weight decreases below the first and
     # above the second. 0 and None: it does not.
     residual_fade_mm: NonNegative = 0.0
@@ -286,7 +288,7 @@ class Scenario(Frozen):
                 f"actuator.computing_delay_s reaches {delay * self.disturbance.level:g}; it must be at "
                 f"most one control_period_s, {self.control_period_s}"
             )
-        controller_row(controller(self.residual_base), self.control_period_s, self.preview_s)
+        controller_row(self.base_controller, self.control_period_s, self.preview_s)
         if self.plant == "kinematic" and (
             self.action == "torque" or isinstance(self.wheel_loop, str)
         ):
@@ -364,14 +366,25 @@ class Scenario(Frozen):
             raise ValueError(
                 f"broadcast_smoothing_s {half_s} must be a multiple of control_period_s {period_s}"
             )
-        delay = self.disturbance.signal("position.delay_s").reach()[1] * self.disturbance.level
-        late_s = 2 * half_s + math.ceil(delay / period_s) * period_s + period_s
-        room_s = self.time_gap_s - max(self.preview_s, default=0.0)
-        if late_s > room_s:
+        if self.smoothing_steps > self._longest_smoothing_steps:
+            late_s = 2 * half_s + (self._fix_delay_steps + 1) * period_s
+            room_s = self.time_gap_s - max(self.preview_s, default=0.0)
             raise ValueError(
                 f"broadcast_smoothing_s {half_s} makes broadcasts {late_s:g} s late; followers use them "
                 f"after {room_s:g} s (time_gap_s less the longest preview_s)"
             )
+
+    @property
+    def _fix_delay_steps(self) -> int:
+        """Control steps that the latest position fix takes to arrive."""
+        delay_s = self.disturbance.signal("position.delay_s").reach()[1] * self.disturbance.level
+        return math.ceil(delay_s / self.control_period_s)
+
+    @property
+    def _longest_smoothing_steps(self) -> int:
+        """The most control steps before and after a moment, so that a message is replaced before its use."""
+        lookahead = max(self.preview_steps, default=0)
+        return max(0, (self.gap_steps - lookahead - self._fix_delay_steps - 1) // 2)
 
     @property
     def substeps(self) -> int:
@@ -395,8 +408,22 @@ class Scenario(Frozen):
 
     @property
     def smoothing_steps(self) -> int:
-        """Control steps before and after a moment that a smoothed broadcast uses."""
-        return round(self.broadcast_smoothing_s / self.control_period_s)
+        """Control steps before and after a moment that a smoothed broadcast uses; 0: none is smoothed."""
+        if self.broadcast_smoothing_s is not None:
+            return round(self.broadcast_smoothing_s / self.control_period_s)
+        usual = round(BROADCAST_SMOOTHING_S / self.control_period_s)
+        return min(usual, self._longest_smoothing_steps)
+
+    @property
+    def smoothing_s(self) -> float:
+        """Time before and after a moment that a smoothed broadcast uses, s; 0: none is smoothed."""
+        given = self.broadcast_smoothing_s
+        return self.smoothing_steps * self.control_period_s if given is None else given
+
+    @property
+    def base_controller(self) -> Controller:
+        """The controller of ``residual_base``; the default goes without its lead where no preview is ahead."""
+        return controller_for(self.residual_base, self.preview_s)
 
     @property
     def settle_s(self) -> float:
@@ -452,7 +479,12 @@ def scenario_with(
         as :func:`load_scenario`; for an unknown key in ``fields``, too.
     """
     if isinstance(source, Scenario):
-        data = source.model_dump()
+        # A field that is left at its default may still be set, for example by what a policy asks for.
+        data = {
+            key: value
+            for key, value in source.model_dump().items()
+            if key in source.model_fields_set
+        }
     elif isinstance(source, Mapping):
         data = dict(source)
     else:
@@ -581,10 +613,11 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             f"rays.range_mm {scenario.rays.range_mm:g} is at most outline_radius_mm {radius_mm:g}: rays "
             "start at the centre of the outline, so that they meet nothing outside"
         )
-    if scenario.estimator == "ekf" and controller(scenario.residual_base).limits.cancel_slip:
+    drives = scenario.action == "residual" or scenario.residual_base != DEFAULT_CONTROLLER
+    if drives and scenario.estimator == "ekf" and scenario.base_controller.limits.cancel_slip:
         lines.append(
             f"residual_base {scenario.residual_base!r} subtracts the estimated slip from its commands, "
-            "but estimator 'ekf' estimates none; use 'ekf-slip'"
+            "but estimator 'ekf' estimates none; use 'ekf-gyro' or 'ekf-slip'"
         )
     return list(dict.fromkeys(lines))
 
