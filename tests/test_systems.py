@@ -104,7 +104,7 @@ def test_a_path_with_a_plus_is_still_one_controller(tmp_path):
         ("kanayama+ekf-slp+body", "estimator 'ekf-slp' is .*; did you mean 'ekf-slip'?"),
         (
             "kanayama+body",
-            "estimator 'body' is not one of ekf, ekf-slip, ekf-gyro, truth, ekf-smoothed",
+            "estimator 'body' is not one of ekf, ekf-slip, ekf-gyro, truth, ekf-slip-without",
         ),
         ("kanayama+", "estimator '' is not one of ekf"),
         ("kanayama+ekf+bodi", "limiter 'bodi' is not one of body, .*, FILE.yaml; did you mean"),

@@ -42,23 +42,23 @@ PYTHON_ESTIMATORS = {
     "ukf": "baselines.policies.estimators.unscented:UnscentedEstimator",
     "moving-horizon": "baselines.policies.estimators.moving_horizon:MovingHorizonEstimator",
 }
-# The fields of the scenario that an estimator's name sets: the filter on board, parameters of it, and what is
-# broadcast of it.
-ESTIMATORS: dict[str, dict[str, Any]] = {
-    **{kind: {"estimator": kind, "broadcast_smoothing_s": 0.0} for kind in ESTIMATOR_KINDS},
-    **{
-        f"{kind}-smoothed": {
-            "estimator": kind,
-            "broadcast_smoothing_s": BROADCAST_SMOOTHING_S,
-        }
-        for kind in SMOOTHED
-    },
+# The fields of the scenario that an estimator's name sets: the filter on board and parameters of it, and the
+# smoothing of what is broadcast of it.
+FILTERS: dict[str, dict[str, Any]] = {
+    **{kind: {"estimator": kind} for kind in ESTIMATOR_KINDS},
     "ekf-slip-without-jumps": {
         "estimator": "ekf-slip",
         "ekf_slip": {"most_acceleration_mm_s2": None, "most_yaw_acceleration_rad_s2": None},
     },
     "ekf-gyro-without-torques": {"estimator": "ekf-gyro", "ekf_gyro": {"torque_time_s": None}},
     **{name: {"estimator": path} for name, path in PYTHON_ESTIMATORS.items()},
+}
+ESTIMATORS: dict[str, dict[str, Any]] = {
+    **{name: fields | {"broadcast_smoothing_s": 0.0} for name, fields in FILTERS.items()},
+    **{
+        f"{kind}-smoothed": {"estimator": kind, "broadcast_smoothing_s": BROADCAST_SMOOTHING_S}
+        for kind in SMOOTHED
+    },
 }
 
 
