@@ -20,6 +20,7 @@ from baselines.policies.network import Network
 from baselines.policies.registry import fit_policy, make_policy, policy_hash
 from baselines.policies.systems import load_limiter
 from baselines.runs.run import run_policy, run_seeds
+from baselines.tuning.start import named_start
 from tlf_env.engine.formation import Formation
 from tlf_env.onboard.observer import Message, dead_reckoned
 from tlf_env.onboard.supervisor import (
@@ -485,6 +486,14 @@ def test_a_supervised_system_asks_for_its_neighbour_and_needs_it(controller):
     for given_to in (make_policy, fit_policy):
         with pytest.raises(ValueError, match="needs the scenario's field neighbour; it is None"):
             given_to(name, refused)
+
+
+def test_a_search_may_start_from_a_law_with_a_supervisor():
+    start = named_start("kanayama:bounded+ekf-slip+supervised").start
+    assert start.limits_of_it == load_limiter("supervised")
+    assert start.scenario_overrides["neighbour"] == Neighbour().model_dump()
+    with pytest.raises(ValueError, match="a controller is searched without a supervisor"):
+        named_start("reference:tuned+ekf-slip+supervised")
 
 
 # Whole rows
