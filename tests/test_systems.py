@@ -22,6 +22,7 @@ from baselines.policies.systems import (
 from baselines.runs.run import run_policy
 from tlf_env.common.presets import preset_names, yaml_text
 from tlf_env.onboard.controllers import controller
+from tlf_env.onboard.tracking import Controller
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S, load_scenario
@@ -139,7 +140,10 @@ def test_a_lead_needs_a_preview():
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(
-    "name", installed(one for one in policy_names() if one != "reference:tuned")
+    "name",
+    installed(
+        one for one in policy_names() if one not in ("reference:linearised", "reference:tuned")
+    ),
 )
 def test_without_a_limiter_the_laws_twist_is_commanded(name, dtype):
     alone = make_policy(name, SCENARIO).predict(rows(dtype))[0]
@@ -162,6 +166,17 @@ def test_the_tuned_reference_is_the_sum_of_its_parts(tmp_path):
     bare = make_policy("reference:tuned+ekf-slip+none", SCENARIO)
     assert bare.controller.limits.lateral_error_mm == 150.0  # a bound on errors stays with its law
     assert bare.controller.limits.yaw_rate_rad_s is None
+
+
+def test_the_linearised_reference_is_a_system_of_a_textbooks_law():
+    """One compiled law, in a controller and behind a limiter: the same bits."""
+    name = "feedback_linearisation:bounded+ekf-gyro-smoothed+body"
+    alone, system = (fit_policy(one, SCENARIO) for one in ("reference:linearised", name))
+    assert (system.scenario, system.overrides) == (alone.scenario, alone.overrides)
+    found, wanted = (one.policy.predict(rows())[0] for one in (system, alone))
+    assert found.tobytes() == wanted.tobytes()
+    with pytest.raises(ValueError, match="gains and linearisation exclude each other"):
+        Controller(gains={}, linearisation={"ahead_mm": 80.0, "gain_per_s": 1.0})
 
 
 def test_a_system_drives_as_its_parts_put_together_by_hand():

@@ -52,7 +52,8 @@ def test_the_error_of_the_point_ahead_decays_with_the_gain(gain):
             "reference_u_1": u_1,
             "reference_u_2": u_2,
         }
-        robot = moved(robot, *policy.twist({name: np.float64(x) for name, x in seen.items()}))
+        forward, turn = policy.twist({name: np.array([x]) for name, x in seen.items()})
+        robot = moved(robot, forward[0], turn[0])
         goal = moved(goal, u_1, u_2)
     assert point(goal) - point(robot) == pytest.approx(math.exp(-gain) * first, abs=0.3)
 

@@ -176,11 +176,12 @@ def own_limiter(law: Controller) -> Limiter:
 def behind(law: Controller, limiter: Limiter) -> Controller:
     """A controller with its gains and bounds on errors, behind a limiter in place of its own limits."""
     bounds = {name: getattr(law.limits, name) for name in BOUNDS}
-    return Controller(
-        gains=law.gains,
-        limits=limiter.limits.model_copy(update=bounds),
-        spacing=limiter.spacing,
-        lead_s=limiter.lead_s,
+    return law.model_copy(
+        update={
+            "limits": limiter.limits.model_copy(update=bounds),
+            "spacing": limiter.spacing,
+            "lead_s": limiter.lead_s,
+        }
     )
 
 

@@ -9,11 +9,14 @@ from typing import Any
 from pydantic import ValidationError, field_validator
 
 from tlf_env.common.errors import one_line
-from tlf_env.common.models import Frozen
+from tlf_env.common.models import Frozen, NonNegative
 from tlf_env.common.presets import is_file_name, preset_names, read_preset_or_file
+from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import EstimatorKind
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import Controller
+
+SCENARIO_FIELDS = ("estimator", "ekf_slip", "ekf_gyro", "broadcast_smoothing_s")
 
 
 class ControllerFile(Frozen):
@@ -22,6 +25,8 @@ class ControllerFile(Frozen):
     controller: Controller  # or the name of a preset
     estimator: EstimatorKind | None = None  # None: not required
     ekf_slip: SlipEkfParameters | None = None
+    ekf_gyro: GyroEkfParameters | None = None
+    broadcast_smoothing_s: NonNegative | None = None
     found: dict[str, Any] | None = None  # how the numbers were found; not used by the code
 
     @field_validator("controller", mode="before")
@@ -31,13 +36,13 @@ class ControllerFile(Frozen):
 
     @property
     def scenario_overrides(self) -> dict[str, Any]:
-        """Fields of the scenario that the file sets: ``estimator``, ``ekf_slip``, or none."""
-        overrides: dict[str, Any] = {}
-        if self.estimator is not None:
-            overrides["estimator"] = self.estimator
-        if self.ekf_slip is not None:
-            overrides["ekf_slip"] = self.ekf_slip.model_dump()
-        return overrides
+        """Fields of the scenario that the file sets, of the estimator and the broadcasts; or none."""
+        given = self.model_dump(include=set(SCENARIO_FIELDS), exclude_none=True)
+        whole = {
+            "ekf_slip": self.ekf_slip,
+            "ekf_gyro": self.ekf_gyro,
+        }  # with their fields that are None
+        return given | {name: part.model_dump() for name, part in whole.items() if part is not None}
 
 
 def controller_names() -> list[str]:

@@ -1,12 +1,15 @@
-"""Tracking controller (TC): errors (16), nominal law (19) and complementary law (21)."""
+"""Tracking controller (TC): errors (16), nominal law (19) and complementary law (21).
+
+In their place a controller may have the law of a textbook, feedback linearisation of a point ahead.
+"""
 
 from __future__ import annotations
 
 import functools
 import math
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from tlf_env.common.models import Frozen, NonNegative, Positive
 from tlf_env.common.presets import read_preset_or_file
@@ -51,23 +54,40 @@ class Gains(NamedTuple):
     epsilon: float
 
 
+class Linearisation(Frozen):
+    """Feedback linearisation of a point ``ahead_mm`` before the axle; its error decays with ``gain_per_s``."""
+
+    ahead_mm: Positive
+    gain_per_s: Positive
+
+
 class Controller(Frozen):
     """Gains of the tracking law, and limits of its command.
 
+    ``linearisation``: this law in place of the paper's, whose ``gains`` then have no effect.
     ``lead_s``: the law uses the reference's twist this much later, interpolated linearly to the first
     preview, to compensate for the control period and the lag of the wheel loop.
     """
 
     gains: TrackingGains = TrackingGains()
+    linearisation: Linearisation | None = None
     limits: TwistLimits = TwistLimits()
     spacing: Spacing | None = None  # distance keeping to the predecessor, if any
     lead_s: NonNegative = 0.0
+
+    @model_validator(mode="after")
+    def _one_law(self) -> Self:
+        if self.linearisation is not None and "gains" in self.model_fields_set:
+            raise ValueError("gains and linearisation exclude each other: they are of two laws")
+        return self
 
 
 class ControllerRow(NamedTuple):
     """The controller for the compiled laws."""
 
     gains: Gains
+    ahead: float  # mm, of the point of the feedback linearisation; 0: the paper's law
+    decay: float  # 1/s, of its error
     limits: TwistLimitsRow
     spacing: SpacingRow
     lead: float  # fraction of the time to the first preview
@@ -88,11 +108,14 @@ def controller_row(
             f"lead_s {controller.lead_s} needs a first preview above 0, got preview_s {preview_s}"
         )
     lead = controller.lead_s / preview_s[0] if controller.lead_s else 0.0
+    point = controller.linearisation
     return ControllerRow(
-        gains_row(controller.gains),
-        twist_limits_row(controller.limits, period_s),
-        spacing_row(controller.spacing),
-        lead,
+        gains=gains_row(controller.gains),
+        ahead=0.0 if point is None else point.ahead_mm,
+        decay=0.0 if point is None else point.gain_per_s,
+        limits=twist_limits_row(controller.limits, period_s),
+        spacing=spacing_row(controller.spacing),
+        lead=lead,
     )
 
 
@@ -139,3 +162,24 @@ def tracking_twist(
     n_1, n_2 = nominal_twist(e_1, e_2, sin_e3, cos_e3, u_1, u_2, gains)
     c_1, c_2 = complementary_twist(e_1, sin_e3, gains)
     return n_1 + c_1, n_2 + c_2
+
+
+@law
+def linearised_twist(
+    e_1: float,
+    e_2: float,
+    sin_e3: float,
+    cos_e3: float,
+    u_1: float,
+    u_2: float,
+    ahead: float,
+    decay: float,
+) -> tuple[float, float]:
+    """Twist (mm/s, rad/s) that lets the error of a point ``ahead`` mm before the axle decay with ``decay`` 1/s.
+
+    Input–output linearisation: Siciliano et al., "Robotics: modelling, planning and control", Springer 2009,
+    section 11.6.2. The point can move in every direction.
+    """
+    forward = u_1 * cos_e3 - ahead * u_2 * sin_e3 + decay * (e_1 + ahead * (cos_e3 - 1.0))
+    right = -u_1 * sin_e3 - ahead * u_2 * cos_e3 + decay * (e_2 - ahead * sin_e3)
+    return forward, -right / ahead

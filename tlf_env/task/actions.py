@@ -13,7 +13,7 @@ from tlf_env.onboard.limiter import braked, limited_twist, saturated
 from tlf_env.onboard.observer import Message
 from tlf_env.onboard.spacing import Predecessor, spaced_twist
 from tlf_env.onboard.supervisor import SupervisorRow, curvature, supervised_twist
-from tlf_env.onboard.tracking import ControllerRow, tracking_twist
+from tlf_env.onboard.tracking import ControllerRow, linearised_twist, tracking_twist
 from tlf_env.physics.vehicle import Body
 from tlf_env.task.observation import Entry, Preview, Tracking
 
@@ -85,23 +85,19 @@ def clipped_action(component: float) -> float:
 def wanted_twist(
     observation: np.ndarray, scales: np.ndarray, row: ControllerRow
 ) -> tuple[float, float]:
-    """Twist (mm/s, rad/s) of the tracking law, eqs (16)–(21), from one ``tracking`` observation."""
+    """Twist (mm/s, rad/s) of the controller's tracking law from one ``tracking`` observation."""
     u_1, u_2 = observation[U_1] * scales[U_1], observation[U_2] * scales[U_2]
     if row.lead > 0.0:
         u_1 += row.lead * (observation[LATER_U_1] * scales[LATER_U_1] - u_1)
         u_2 += row.lead * (observation[LATER_U_2] * scales[LATER_U_2] - u_2)
-    return tracking_twist(
-        saturated(
-            braked(observation[E_1] * scales[E_1], row.limits.braking_error),
-            row.limits.forward_error,
-        ),
-        saturated(observation[E_2] * scales[E_2], row.limits.lateral_error),
-        observation[SIN_E_3] * scales[SIN_E_3],
-        observation[COS_E_3] * scales[COS_E_3],
-        u_1,
-        u_2,
-        row.gains,
+    e_1 = saturated(
+        braked(observation[E_1] * scales[E_1], row.limits.braking_error), row.limits.forward_error
     )
+    e_2 = saturated(observation[E_2] * scales[E_2], row.limits.lateral_error)
+    sin, cos = observation[SIN_E_3] * scales[SIN_E_3], observation[COS_E_3] * scales[COS_E_3]
+    if row.ahead > 0.0:
+        return linearised_twist(e_1, e_2, sin, cos, u_1, u_2, row.ahead, row.decay)
+    return tracking_twist(e_1, e_2, sin, cos, u_1, u_2, row.gains)
 
 
 @law

@@ -8,8 +8,10 @@ import numpy as np
 
 from baselines.policies.laws.law import UNBOUNDED, ErrorBounds, LawFile, Memoryless
 from tlf_env.common.models import Positive
+from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.supervisor import Neighbour
+from tlf_env.onboard.tracking import linearised_twist
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
 
@@ -59,6 +61,20 @@ class PurePursuit(Memoryless):
         return speed, curvature * np.abs(speed)
 
 
+_LINEARISED_FROM = ("e_1", "e_2", "sin_e_3", "cos_e_3", "reference_u_1", "reference_u_2")
+
+
+@driver
+def _linearised(
+    seen: np.ndarray, ahead: float, decay: float, forward: np.ndarray, yaw_rate: np.ndarray
+) -> None:
+    """The law of each column of ``seen``, whose rows are errors and the reference's twist."""
+    for i in range(seen.shape[1]):
+        forward[i], yaw_rate[i] = linearised_twist(
+            seen[0, i], seen[1, i], seen[2, i], seen[3, i], seen[4, i], seen[5, i], ahead, decay
+        )
+
+
 class FeedbackLinearisationFile(LawFile):
     """Parameters of :class:`FeedbackLinearisation` in a file; None: its default."""
 
@@ -69,8 +85,8 @@ class FeedbackLinearisationFile(LawFile):
 class FeedbackLinearisation(Memoryless):
     """Input–output linearisation of a point ``ahead_mm`` in front of the axle.
 
-    Siciliano et al., "Robotics: modelling, planning and control", Springer 2009, section 11.6.2. The
-    point can move in every direction, and its error decays with ``gain_per_s``.
+    The law of :func:`tlf_env.onboard.tracking.linearised_twist`, with its source there. The error of the point
+    decays with ``gain_per_s``.
     """
 
     def __init__(
@@ -88,11 +104,15 @@ class FeedbackLinearisation(Memoryless):
 
     def twist(self, seen: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
         """The twist that gives the point the desired velocity."""
-        b, sin, cos = self.ahead_mm, seen["sin_e_3"], seen["cos_e_3"]
-        u_1, u_2 = seen["reference_u_1"], seen["reference_u_2"]
-        forward = u_1 * cos - b * u_2 * sin + self.gain_per_s * (seen["e_1"] + b * (cos - 1.0))
-        right = -u_1 * sin - b * u_2 * cos + self.gain_per_s * (seen["e_2"] - b * sin)
-        return forward, -right / b
+        forward, yaw_rate = np.empty_like(seen["e_1"]), np.empty_like(seen["e_1"])
+        _linearised(
+            np.stack([seen[name] for name in _LINEARISED_FROM]),
+            self.ahead_mm,
+            self.gain_per_s,
+            forward,
+            yaw_rate,
+        )
+        return forward, yaw_rate
 
 
 class KanayamaFile(LawFile):
