@@ -113,6 +113,7 @@ class FormationVecEnv(VecEnv):
                 "action",
                 "preview_s",
                 "rays",
+                "neighbour",
                 "dtype",
                 "control_period_s",
             ):

@@ -117,6 +117,8 @@ CHANGES: list[dict[str, Any]] = [
     {"rays": {}},
     {"rays": {"count": 8}},
     {"rays": {"period_s": 0.1}},
+    {"neighbour": {}},
+    {"neighbour": {"range_mm": 900.0}},
     {"end_on": ()},
     {"end_on": ("lost",)},
     {"residual_reach_mm": 30.0},

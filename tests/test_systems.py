@@ -108,7 +108,10 @@ def test_a_path_with_a_plus_is_still_one_controller(tmp_path):
         ),
         ("kanayama+", "estimator '' is not one of ekf"),
         ("kanayama+ekf+bodi", "limiter 'bodi' is not one of body, .*, FILE.yaml; did you mean"),
-        ("kanayama+ekf+", "limiter '' is not one of body, none, slippery, yaw-rate, FILE.yaml"),
+        (
+            "kanayama+ekf+",
+            "limiter '' is not one of body, none, slippery, supervised, yaw-rate, FILE",
+        ),
         ("kanayama+ekf+body+none", r"limiter 'body\+none' is not one of"),
         ("kanayama+ekf+no_such.yaml", "cannot read no_such.yaml"),
         ("kanayama:no_such.yaml+ekf", "cannot read no_such.yaml"),

@@ -23,6 +23,7 @@ from tlf_env.common.errors import one_line
 from tlf_env.common.files import atomic, parse_json
 from tlf_env.common.models import Frozen, NonNegative, Positive, Whole
 from tlf_env.onboard.rays import Rays
+from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.actions import ACTION_ENTRIES, ActionKind
 from tlf_env.task.observation import SAMPLE_ENTRIES, sensor_entries, tracking_entries
 from tlf_env.task.scenario import Scenario
@@ -47,6 +48,7 @@ class Card(Frozen):
     entries: dict[str, Positive]  # that the policy takes, in its order, with their scales
     preview_s: tuple[NonNegative, ...]  # () for sensor, which has none
     rays: Rays | None = None  # None: it takes none, whether there are range sensors or not
+    neighbour: Neighbour | None = None  # likewise
     control_period_s: Positive
     residual_base: Word | None = None  # gains of the base that a residual is added to
     residual_fade_mm: NonNegative = 0.0  # estimated errors at which the residual counts half
@@ -98,8 +100,9 @@ class Card(Frozen):
         theirs = interface(scenario)
         if set(self.preview_s) <= set(theirs["preview_s"]):
             theirs["preview_s"] = self.preview_s
-        if self.rays is None:
-            theirs["rays"] = None
+        for optional in ("rays", "neighbour"):
+            if getattr(self, optional) is None:
+                theirs[optional] = None
         if self.action != "residual":
             theirs["estimator"] = self.estimator
         theirs["broadcast_smoothing_s"] = self.broadcast_smoothing_s
@@ -129,7 +132,8 @@ class Card(Frozen):
             naming an entry that the observation lacks, or that has another scale.
         """
         return find_scaled_columns(
-            self.entries, _scales(self.observation, self.preview_s, self.samples, self.rays)
+            self.entries,
+            _scales(self.observation, self.preview_s, self.samples, self.rays, self.neighbour),
         )
 
 
@@ -142,11 +146,17 @@ class Loaded(NamedTuple):
 
 
 def _scales(
-    observation: str, preview_s: tuple[float, ...], samples: int, rays: Rays | None
+    observation: str,
+    preview_s: tuple[float, ...],
+    samples: int,
+    rays: Rays | None,
+    neighbour: Neighbour | None,
 ) -> dict[str, float]:
     """Entries of an observation and their scales, in order."""
-    tracking = observation == "tracking"
-    entries = tracking_entries(preview_s, rays) if tracking else sensor_entries(samples, rays)
+    if observation == "tracking":
+        entries = tracking_entries(preview_s, rays, neighbour)
+    else:
+        entries = sensor_entries(samples, rays)
     return {name: entry.scale for name, entry in entries.items()}
 
 
@@ -165,7 +175,10 @@ def interface(scenario: Scenario) -> dict[str, Any]:
         "observation": scenario.observation,
         "preview_s": previews,
         "rays": scenario.rays,
-        "entries": _scales(scenario.observation, previews, scenario.substeps, scenario.rays),
+        "neighbour": scenario.neighbour,
+        "entries": _scales(
+            scenario.observation, previews, scenario.substeps, scenario.rays, scenario.neighbour
+        ),
         "action_scales": tuple(entry.scale for entry in ACTION_ENTRIES[scenario.action]),
     }
 

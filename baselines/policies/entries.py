@@ -19,6 +19,7 @@ from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
+from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.actions import ACTION_ENTRIES, ActionKind
 from tlf_env.task.observation import Entry, sensor_entries, tracking_entries
 from tlf_env.task.scenario import Scenario
@@ -42,6 +43,7 @@ class AskedFields(Frozen):
     residual_reach_mm: float | None = None
     preview_s: tuple[float, ...] | None = None
     rays: Rays | None = None
+    neighbour: Neighbour | None = None
 
     @field_validator("estimator")
     @classmethod
@@ -199,7 +201,7 @@ def entries_of(scenario: Scenario) -> dict[str, Entry]:
     """The entries of a scenario's observation by name, in order."""
     if scenario.observation == "sensor":
         return sensor_entries(scenario.substeps, scenario.rays)
-    return tracking_entries(scenario.preview_s, scenario.rays)
+    return tracking_entries(scenario.preview_s, scenario.rays, scenario.neighbour)
 
 
 def hello(scenario: Scenario) -> dict[str, Any]:

@@ -114,6 +114,7 @@ class LearnedPolicy:
         if card.observation == "tracking":
             asked["preview_s"] = card.preview_s
         asked["rays"] = None if card.rays is None else card.rays.model_dump()
+        asked["neighbour"] = None if card.neighbour is None else card.neighbour.model_dump()
         self.scenario_overrides = {
             field: value
             for field, value in asked.items()

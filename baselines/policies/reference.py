@@ -12,21 +12,30 @@ from baselines.policies.columns import find_columns
 from tlf_env.common.presets import is_file_name
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for, load_controller
+from tlf_env.onboard.supervisor import Neighbour, Supervisor, SupervisorRow, supervisor_row
 from tlf_env.onboard.tracking import (
     Controller,
     ControllerRow,
     TrackingGains,
     controller_row,
 )
-from tlf_env.task.actions import ACTION_SIZE, reference_action
-from tlf_env.task.observation import Tracking, tracking_entries
+from tlf_env.task.actions import ACTION_SIZE, allowed_twist, twist_action, wanted_twist
+from tlf_env.task.observation import NEIGHBOUR_ENTRIES, Tracking, tracking_entries
 from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S, DEFAULT_PREVIEW_S
 
 
 @driver
-def _actions(rows: np.ndarray, scales: np.ndarray, row: ControllerRow, out: np.ndarray) -> None:
+def _actions(
+    rows: np.ndarray,
+    scales: np.ndarray,
+    row: ControllerRow,
+    supervisor: SupervisorRow,
+    out: np.ndarray,
+) -> None:
     for i in range(rows.shape[0]):
-        out[i, 0], out[i, 1] = reference_action(rows[i], scales, row)
+        u_1, u_2 = wanted_twist(rows[i], scales, row)
+        u_1, u_2 = allowed_twist(rows[i], scales, row, supervisor, u_1, u_2)
+        out[i, 0], out[i, 1] = twist_action(rows[i], scales, row, u_1, u_2)
 
 
 class ReferencePolicy:
@@ -43,6 +52,9 @@ class ReferencePolicy:
         Control period, s; needed for the limits on accelerations.
     preview_s
         The scenario's previews, s; a lead is computed from the first.
+    supervisor
+        Slows the robot down for its neighbour, whose entries the observation then has to have. None: does
+        not.
 
     Raises
     ------
@@ -60,6 +72,7 @@ class ReferencePolicy:
         gains: str | TrackingGains | Controller = DEFAULT_CONTROLLER,
         control_period_s: float = DEFAULT_CONTROL_PERIOD_S,
         preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S,
+        supervisor: Supervisor | None = None,
     ) -> None:
         self.files: tuple[Path, ...] = ()
         asked: dict[str, Any] = {}
@@ -78,10 +91,17 @@ class ReferencePolicy:
             now = tracking_entries(())
             names += [name for name in tracking_entries(preview_s[:1]) if name not in now]
         entries = tracking_entries(preview_s)
+        self.supervisor = supervisor
+        self._supervisor_row = supervisor_row(supervisor, len(names))
+        if supervisor is not None:
+            names += NEIGHBOUR_ENTRIES
+            entries = tracking_entries(preview_s, neighbour=Neighbour())
         self._columns = find_columns(names, entries)
         self._preview_s = tuple(preview_s)
         self._needed = int(self._columns.places.max()) + 1
         self._scales = np.array([entries[name].scale for name in names])
+        if supervisor is not None:
+            asked = {"neighbour": Neighbour().model_dump()} | asked
         self.scenario_overrides = asked
 
     def predict(
@@ -113,5 +133,5 @@ class ReferencePolicy:
             rows = self._columns.take(rows)
         rows = np.ascontiguousarray(rows)
         action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
-        _actions(rows, self._scales, self._row, action)
+        _actions(rows, self._scales, self._row, self._supervisor_row, action)
         return (action[0] if observation.ndim == 1 else action), state

@@ -45,7 +45,12 @@ OVERRIDABLE = (
     "broadcast_smoothing_s",
     "preview_s",
     "rays",
+    "neighbour",
 )
+
+
+# Fields that lengthen the observation, for which a law is made.
+MADE_FOR = ("preview_s", "rays", "neighbour")
 
 
 class FittedPolicy(NamedTuple):
@@ -86,6 +91,7 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
     policy = _made(name, scenario, trust=trust)
     if isinstance(policy, LearnedPolicy):
         policy.bind(name, scenario)
+    _check_heard(name, policy, scenario)
     return policy
 
 
@@ -123,13 +129,22 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
         }
         asked = {field: _plain(value) for field, value in differing.items()}
         scenario = fitted if asked else scenario
-        if "preview_s" in asked and isinstance(policy, Law | LimitedLaw):
-            policy = _made(name, scenario, trust=trust)  # a law is made for the previews
+        if asked.keys() & MADE_FOR and isinstance(policy, Law | LimitedLaw):
+            policy = _made(name, scenario, trust=trust)
     if isinstance(policy, LearnedPolicy):
         policy.bind(name, scenario)
     elif isinstance(policy, EntryPolicy):
         policy.bind(scenario)
+    _check_heard(name, policy, scenario)
     return FittedPolicy(policy, scenario, asked)
+
+
+def _check_heard(name: str, policy: Policy, scenario: Scenario) -> None:
+    """Check that a system with a supervisor has a neighbour to look out for."""
+    if getattr(policy, "supervisor", None) is not None and scenario.neighbour is None:
+        raise ValueError(
+            f"system {name!r} has a supervisor, which needs the scenario's field neighbour; it is None"
+        )
 
 
 def _plain(value: Any) -> Any:
@@ -283,7 +298,8 @@ def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
     data, _, _ = load_from_zip_file(path, device="cpu")
     algorithm = _algorithm_of(data or {}, path)
     model = getattr(stable_baselines3, algorithm).load(path, device="cpu")
-    wanted = (len(tracking_entries(scenario.preview_s, scenario.rays)),)
+    entries = tracking_entries(scenario.preview_s, scenario.rays, scenario.neighbour)
+    wanted = (len(entries),)
     seen, given = model.observation_space.shape, model.action_space.shape
     if scenario.observation == "tracking" and (seen != wanted or given != (ACTION_SIZE,)):
         raise ValueError(

@@ -14,9 +14,10 @@ from pydantic import ValidationError, field_validator
 from baselines.policies.laws.catalogue import LAWS, law_names, make_law
 from baselines.policies.laws.law import BOUNDS, Law
 from baselines.policies.reference import ReferencePolicy
-from tlf_env.common.errors import one_line, suggestion
+from tlf_env.common.errors import one_line, shown, suggestion
 from tlf_env.common.models import Frozen, NonNegative
 from tlf_env.common.presets import (
+    beside,
     is_file_name,
     preset_names,
     preset_or_file,
@@ -28,8 +29,9 @@ from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.limiter import TwistLimits
 from tlf_env.onboard.parts import Policy, load_part
 from tlf_env.onboard.spacing import Spacing
+from tlf_env.onboard.supervisor import Neighbour, Supervisor, SupervisorRow, supervisor_row
 from tlf_env.onboard.tracking import Controller, ControllerRow, controller_row
-from tlf_env.task.actions import ACTION_SIZE, twist_action
+from tlf_env.task.actions import ACTION_SIZE, allowed_twist, twist_action
 from tlf_env.task.scenario import BROADCAST_SMOOTHING_S, Scenario
 
 FORM = "CONTROLLER+ESTIMATOR or CONTROLLER+ESTIMATOR+LIMITER"
@@ -74,13 +76,15 @@ class SystemName(NamedTuple):
 
 
 class Limiter(Frozen):
-    """Contents of a limiter file: limits on the twist, distance keeping and lead, for any controller.
+    """Contents of a limiter: limits on the twist, distance keeping, supervisor and lead, for any controller.
 
+    The file of a limiter may also have ``base``, another limiter, whose values count where it has none.
     Bounds on errors are part of a controller: they change what its law sees, not what it may command.
     """
 
     limits: TwistLimits = TwistLimits()
     spacing: Spacing | None = None
+    supervisor: Supervisor | None = None
     lead_s: NonNegative = 0.0
 
     @field_validator("limits")
@@ -140,10 +144,37 @@ def load_limiter(source: str | Path) -> Limiter:
     ValueError
         in one line, if there is no such preset or file, or a key or value in it is not allowed.
     """
+    own = read_preset_or_file("limiter", source)
+    base = _base_of(source, own)
+    inherited = {} if base is None else read_preset_or_file("limiter", base)
+    if "base" in inherited:
+        raise ValueError(f"{source}: base {base!r} has a base itself; one level is allowed")
+    values = inherited | {key: value for key, value in own.items() if key != "base"}
+    for key, value in values.items():
+        if isinstance(value, Mapping) and isinstance(inherited.get(key), Mapping):
+            values[key] = {**inherited[key], **value}
     try:
-        return Limiter.model_validate(read_preset_or_file("limiter", source))
+        return Limiter.model_validate(values)
     except ValidationError as error:
         raise ValueError(f"{source}: {one_line(error, Limiter)}") from error
+
+
+def _base_of(source: str | Path, own: Mapping[str, Any]) -> str | None:
+    """The base that a limiter's file names, a preset or a path; None without one."""
+    base = own.get("base")
+    path = preset_or_file("limiter", str(source))
+    if base is None or path is None:
+        return None
+    if not isinstance(base, str):
+        raise ValueError(f"{source}: base {shown(base)} must be a limiter's name or its file")
+    return str(beside(path.parent, base))
+
+
+def limiter_files(source: str) -> list[Path]:
+    """The files that a limiter is made from: its own and that of its base, if any."""
+    base = _base_of(source, read_preset_or_file("limiter", source))
+    paths = [preset_or_file("limiter", one) for one in (source, base) if one is not None]
+    return [path for path in paths if path is not None]
 
 
 def own_limiter(law: Controller) -> Limiter:
@@ -166,10 +197,21 @@ def behind(law: Controller, limiter: Limiter) -> Controller:
 
 @driver
 def _limited(
-    rows: np.ndarray, scales: np.ndarray, row: ControllerRow, wanted: np.ndarray, out: np.ndarray
+    rows: np.ndarray,
+    scales: np.ndarray,
+    row: ControllerRow,
+    supervisor: SupervisorRow,
+    wanted: np.ndarray,
+    out: np.ndarray,
 ) -> None:
     for i in range(rows.shape[0]):
-        out[i, 0], out[i, 1] = twist_action(rows[i], scales, row, wanted[i, 0], wanted[i, 1])
+        u_1, u_2 = allowed_twist(rows[i], scales, row, supervisor, wanted[i, 0], wanted[i, 1])
+        out[i, 0], out[i, 1] = twist_action(rows[i], scales, row, u_1, u_2)
+
+
+def asked_by(limiter: Limiter) -> dict[str, Any]:
+    """The scenario's fields that a limiter asks for."""
+    return {} if limiter.supervisor is None else {"neighbour": Neighbour().model_dump()}
 
 
 class LimitedLaw:
@@ -206,6 +248,9 @@ class LimitedLaw:
         self.law, self.limiter = law, limiter
         # The gains of the row are not used: the law that wants the twist is another.
         self._row = controller_row(behind(Controller(), limiter), control_period_s, preview_s)
+        self.supervisor = limiter.supervisor
+        self._supervisor_row = supervisor_row(limiter.supervisor, law.place("neighbour_heard"))
+        self.scenario_overrides = asked_by(limiter)
 
     def predict(
         self,
@@ -231,7 +276,7 @@ class LimitedLaw:
         )
         rows = np.ascontiguousarray(np.atleast_2d(observation))
         action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
-        _limited(rows, self.law.scales, self._row, wanted, action)
+        _limited(rows, self.law.scales, self._row, self._supervisor_row, wanted, action)
         return (action[0] if observation.ndim == 1 else action), state
 
 
@@ -260,7 +305,7 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
         if path is None:
             raise _unknown(name, "limiter", system.limiter, limiters())
         limiter = load_limiter(system.limiter)
-        files.append(path)
+        files += limiter_files(system.limiter)
     head, _, tail = system.controller.partition(":")
     kind = "controller" if head == "reference" else head
     known = kind == "controller" or kind in LAWS
@@ -273,7 +318,8 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
     if kind == "controller":
         law = controller_for(tail or DEFAULT_CONTROLLER, scenario.preview_s)
         whole = behind(law, own_limiter(law) if limiter is None else limiter)
-        policy = ReferencePolicy(whole, period_s, preview_s)
+        supervisor = None if limiter is None else limiter.supervisor
+        policy = ReferencePolicy(whole, period_s, preview_s, supervisor)
         files += [] if path is None else [path]
     else:
         made = make_law(head, tail, scenario)
@@ -282,7 +328,8 @@ def make_system(system: SystemName, scenario: Scenario) -> Policy:
         files += [Path(inspect.getfile(type(made))), *made.files]
     policy.files = tuple(files)
     policy.privileged = system.estimator == "truth"
-    policy.scenario_overrides = {**asked, **ESTIMATORS[system.estimator]}
+    heard = {} if limiter is None else asked_by(limiter)
+    policy.scenario_overrides = {**asked, **heard, **ESTIMATORS[system.estimator]}
     return policy
 
 

@@ -15,6 +15,7 @@ from baselines.policies.systems import (
     LimitedLaw,
     Limiter,
     SystemName,
+    asked_by,
     behind,
     load_limiter,
     own_limiter,
@@ -53,13 +54,18 @@ class LawStart(Limiter):
     @property
     def limits_of_it(self) -> Limiter:
         """The limiter."""
-        return Limiter(limits=self.limits, spacing=self.spacing, lead_s=self.lead_s)
+        return Limiter(
+            limits=self.limits,
+            spacing=self.spacing,
+            supervisor=self.supervisor,
+            lead_s=self.lead_s,
+        )
 
     @property
     def scenario_overrides(self) -> dict[str, Any]:
         """The scenario's fields that the law and a named estimator ask for."""
         estimator = ESTIMATORS[self.estimator] if self.estimator is not None else {}
-        return {**LAWS[self.law][0].scenario_overrides, **estimator}
+        return {**LAWS[self.law][0].scenario_overrides, **asked_by(self), **estimator}
 
     def with_numbers(self, parameters: dict[str, Any], limiter: dict[str, Any]) -> LawStart:
         """The same law with other parameters and another limiter.
@@ -145,5 +151,7 @@ def named_start(name: str) -> Named:
             f"start {name!r}: a controller is searched without smoothed broadcasts, and with the parameters "
             f"of {estimator!r} that it finds itself"
         )
+    if limiter is not None and limiter.supervisor is not None:
+        raise ValueError(f"start {name!r}: a controller is searched without a supervisor")
     known = controller(tail or DEFAULT_CONTROLLER) if head == "reference" else controller(head)
     return Named(behind(known, limiter or own_limiter(known)), estimator)

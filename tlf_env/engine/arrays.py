@@ -250,7 +250,7 @@ def make_arrays(
     scenario = scenarios[0]
     robots = scenario.robot_count
     dtype = np.dtype(scenario.dtype)
-    tracking = tracking_entries(scenario.preview_s, scenario.rays)
+    tracking = tracking_entries(scenario.preview_s, scenario.rays, scenario.neighbour)
     sensor = sensor_entries(scenario.substeps, scenario.rays)
     sensor_size = len(sensor) if scenario.observation == "sensor" else 0
     rays = np.zeros((0, 2)) if scenario.rays is None else scenario.rays.directions

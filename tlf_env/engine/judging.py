@@ -18,7 +18,13 @@ from tlf_env.engine.arrays import (
     read_wanted,
 )
 from tlf_env.engine.layout import in_array
-from tlf_env.engine.radio import delayed_message, latest_message, read_reference
+from tlf_env.engine.radio import (
+    delayed_message,
+    latest_message,
+    nearest_neighbour,
+    neighbour_message,
+    read_reference,
+)
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
@@ -46,6 +52,22 @@ TRUNCATES = (False, False, False, True, True)
 CLIPPED = Info._fields.index("clipped")
 BODY_D = in_array("body", "d")
 SAMPLE_SIZE = len(SAMPLE_ENTRIES)  # the first fields of a Sample
+
+
+@law
+def observe_neighbour(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> None:
+    """Write the entries of a robot's neighbour, before those of the range sensors."""
+    heard, its = 0.0, Preview(0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+    neighbour = nearest_neighbour(arrays, lane, robot, step, settings)
+    if neighbour >= 0:
+        estimate = read_estimate(arrays.states, robot, lane)
+        message = neighbour_message(arrays, lane, robot, neighbour, step, settings)
+        heard, its = 1.0, preview_entries(message, estimate.x, estimate.y, estimate.theta)
+    place = arrays.observations.shape[2] - arrays.ranges.shape[2] - len(its) - 1
+    arrays.observations[lane, robot, place] = scaled(heard, arrays.scales[place])
+    for i in range(len(its)):
+        place += 1
+        arrays.observations[lane, robot, place] = scaled(its[i], arrays.scales[place])
 
 
 @law
@@ -114,6 +136,8 @@ def observe_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Se
         for i in range(len(preview)):
             j = entries + p * len(preview) + i
             arrays.observations[lane, robot, j] = scaled(preview[i], arrays.scales[j])
+    if settings.neighbour_range > 0.0:
+        observe_neighbour(arrays, lane, robot, step, settings)
 
 
 @law

@@ -29,6 +29,7 @@ from tlf_env.onboard.observer import (
     smoothing,
 )
 from tlf_env.physics.vehicle import forward_and_yaw
+from tlf_env.task.measures import distance
 
 
 @law
@@ -73,11 +74,11 @@ def lateness(
 
 @law
 def received_message(
-    arrays: Arrays, lane: int, robot: int, step: int, late: int, settings: Settings
+    arrays: Arrays, lane: int, sender: int, step: int, late: int, settings: Settings
 ) -> Message:
-    """The predecessor at a control step, by dead reckoning from a message ``late`` periods older."""
+    """A sender at a control step, by dead reckoning from its message ``late`` periods older."""
     old = max(step - late, 0)
-    message = read_message(arrays.messages, old % arrays.messages.shape[1], robot - 1, lane)
+    message = read_message(arrays.messages, old % arrays.messages.shape[1], sender, lane)
     if late > 0:
         message = dead_reckoned(message, min(late, max(step, 0)) * settings.period)
     return message
@@ -94,14 +95,43 @@ def delayed_message(
     passed, it is the predecessor's start pose, at rest.
     """
     late, _ = lateness(arrays, lane, robot, step, settings)
-    return received_message(arrays, lane, robot, step - settings.gap, late, settings)
+    return received_message(arrays, lane, robot - 1, step - settings.gap, late, settings)
 
 
 @law
 def latest_message(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> Message:
     """A robot's message at a control step about its predecessor now; jitter as above."""
     _, late = lateness(arrays, lane, robot, step, settings)
-    return received_message(arrays, lane, robot, step, late, settings)
+    return received_message(arrays, lane, robot - 1, step, late, settings)
+
+
+@law
+def nearest_neighbour(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> int:
+    """The nearest robot in range with a smaller number, other than the predecessor; −1 if there is none.
+
+    The true distance counts: it decides how well a radio receives.
+    """
+    slot = step % arrays.paths.shape[1]
+    nearest, within = -1, settings.neighbour_range
+    for other in range(robot - 1):
+        away = distance(
+            arrays.paths[0, slot, robot, lane],
+            arrays.paths[1, slot, robot, lane],
+            arrays.paths[0, slot, other, lane],
+            arrays.paths[1, slot, other, lane],
+        )
+        if away <= within:
+            nearest, within = other, away
+    return nearest
+
+
+@law
+def neighbour_message(
+    arrays: Arrays, lane: int, robot: int, neighbour: int, step: int, settings: Settings
+) -> Message:
+    """A robot's message at a control step about a neighbour now, as late as that of its predecessor."""
+    _, late = lateness(arrays, lane, robot, step, settings)
+    return received_message(arrays, lane, neighbour, step, late, settings)
 
 
 @law

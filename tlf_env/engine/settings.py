@@ -44,6 +44,7 @@ class Settings(NamedTuple):
     ray_range: float  # mm
     ray_noise: float  # standard deviation, mm
     ray_period: int  # control steps from a reading of the range sensors to the next
+    neighbour_range: float  # mm; 0 where robots hear only their predecessors
     cooperative: bool  # every robot gets the formation's mean reward
     changing: bool  # whether a channel of every substep varies within an episode
     adversary: bool
@@ -83,6 +84,7 @@ def make_settings(scenario: Scenario) -> Settings:
         ray_range=rays.range_mm,
         ray_noise=rays.noise_std_mm,
         ray_period=round((rays.period_s or scenario.control_period_s) / scenario.control_period_s),
+        neighbour_range=0.0 if scenario.neighbour is None else scenario.neighbour.range_mm,
         cooperative=scenario.cooperative,
         changing=changes_within_episode(scenario.disturbance),
         adversary=scenario.adversary,

@@ -13,6 +13,7 @@ from tlf_env.task.actions import ACTION_ENTRIES
 from tlf_env.task.feasibility import SENSOR_FIX_LIMIT_MM, SENSOR_START_LIMIT_MM, SENSOR_TIME_LIMIT_S
 from tlf_env.task.info import MEANINGS
 from tlf_env.task.observation import (
+    NEIGHBOUR_ENTRIES,
     OBSERVATION_LIMIT,
     PREVIEW_ENTRIES,
     RAY_MEANING,
@@ -67,6 +68,11 @@ def observation_section() -> str:
             table(columns, entry_rows(TRACKING_ENTRIES)),
             f"followed by {each} entries for each time of `preview_s`, named `NAME_in_TIME_s`:",
             table(columns, entry_rows(PREVIEW_ENTRIES, count)),
+            "and, with a `neighbour`, by:",
+            table(
+                ("entry", "meaning", "unit", "scale"),
+                [row[1:] for row in entry_rows(NEIGHBOUR_ENTRIES)],
+            ),
             "`sensor`: for each substep of the last step, oldest first, named `NAME_K`:",
             table(columns, entry_rows(SAMPLE_ENTRIES)),
             "followed by:",
@@ -234,6 +240,27 @@ readings_mm = observations["robot_1"][-16:] * env.scenario.rays.range_mm
 Sixteen rays on each of three robots add 3.5 µs to a control step of 58 µs (7 µs with noise), and in a batch
 1.8 µs to 18 µs for each formation (3.5 µs with noise). Where the space contains more than walls, static
 obstacles and round robots, a reading takes 0.1 ms more.
+
+## Hearing beyond the predecessor
+
+With `neighbour`, a robot hears the broadcasts of one more robot than its predecessor, in the observation
+`tracking`:
+
+```python
+env = tlf_env.parallel_env("infinity", robots=6, neighbour={"range_mm": 2000.0})
+```
+
+- The neighbour of a robot is the nearest within `range_mm` (at most 5000) of the robots with smaller numbers,
+  its predecessor left out. The true distance of the axle midpoints counts, as it decides how well a radio
+  receives. The leader and `robot_1` have no neighbour.
+- Robots with smaller numbers go first: they do not hear those behind them, and do not wait for them. So no
+  two robots wait for each other; the reference of the leader waits for none. The price: a robot that stands
+  in the way of one with a smaller number is not noticed by it.
+- `neighbour_heard` is 1 if there is a neighbour. The other entries are those of a predecessor, from the
+  neighbour's latest message; it may be lost or late like the predecessor's ([`radio`](disturbances.md)).
+  Without a neighbour all are 0.
+- Hearing changes no bit of the motion or of the other entries. What a robot makes of it is up to its policy:
+  the limiter [`supervised`](controller/supervisor.md) slows down and waits.
 
 ## Many formations
 

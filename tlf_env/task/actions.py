@@ -10,7 +10,9 @@ import numpy as np
 from tlf_env.numerics.compiled import law
 from tlf_env.onboard.calibration import Belief, believed_wheel_speeds
 from tlf_env.onboard.limiter import braked, limited_twist, saturated
+from tlf_env.onboard.observer import Message
 from tlf_env.onboard.spacing import Predecessor, spaced_twist
+from tlf_env.onboard.supervisor import SupervisorRow, curvature, supervised_twist
 from tlf_env.onboard.tracking import ControllerRow, linearised_twist, tracking_twist
 from tlf_env.physics.vehicle import Body
 from tlf_env.task.observation import Entry, Preview, Tracking
@@ -110,6 +112,41 @@ def received_predecessor(observation: np.ndarray, scales: np.ndarray) -> Predece
         observation[i + 4] * scales[i + 4],
         observation[i + 5] * scales[i + 5],
     )
+
+
+@law
+def heard_message(observation: np.ndarray, scales: np.ndarray, i: int) -> Message:
+    """The message behind six entries from ``i`` on, in a world with the robot at its origin, heading 0."""
+    return Message(
+        observation[i + 1] * scales[i + 1],
+        observation[i] * scales[i],
+        math.atan2(observation[i + 2] * scales[i + 2], observation[i + 3] * scales[i + 3]),
+        observation[i + 4] * scales[i + 4],
+        observation[i + 5] * scales[i + 5],
+    )
+
+
+@law
+def allowed_twist(
+    observation: np.ndarray,
+    scales: np.ndarray,
+    row: ControllerRow,
+    supervisor: SupervisorRow,
+    u_1: float,
+    u_2: float,
+) -> tuple[float, float]:
+    """A twist (mm/s, rad/s) as the supervisor allows it, before the limits of :func:`twist_action`."""
+    i = supervisor.place
+    if i < 0 or observation[i] * scales[i] < 0.5:
+        return u_1, u_2
+    other = heard_message(observation, scales, i + 1)
+    ahead = heard_message(observation, scales, PREDECESSOR)
+    now = (
+        observation[COMMAND_1] * scales[COMMAND_1]
+        + row.limits.slip * observation[SLIP_1] * scales[SLIP_1]
+    )
+    later_bend = curvature(observation[U_1] * scales[U_1], observation[U_2] * scales[U_2])
+    return supervised_twist(u_1, u_2, now, later_bend, other, ahead, supervisor)
 
 
 @law

@@ -63,6 +63,7 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "residual_reach_mm": None,
         "observation": "tracking",
         "rays": None,
+        "neighbour": None,
         "dtype": "float32",
         "preview_s": [0.5, 1.0],
         "reward": {
@@ -262,6 +263,7 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "period_s": None,
         "first_angle_rad": 0.0,
     },
+    "Neighbour": {"range_mm": ALWAYS},
     "Constant": {"type": ALWAYS, "value": ALWAYS},
     "Step": {"type": ALWAYS, "value": ALWAYS, "at_s": ALWAYS, "before": None},
     "Impulse": {

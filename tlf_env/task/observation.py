@@ -9,6 +9,7 @@ from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
 from tlf_env.onboard.observer import Message, Reference
 from tlf_env.onboard.rays import Rays
+from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.onboard.tracking import body_errors
 
 OBSERVATION_LIMIT = 10.0
@@ -121,6 +122,25 @@ PREVIEW_ENTRIES = {
 }
 
 
+# Entries of the nearest robot that is heard besides the predecessor: whether there is one, and its Preview.
+NEIGHBOUR_ENTRIES = {
+    "neighbour_heard": Entry(
+        "1 if a robot with a smaller number, other than the predecessor, is within range_mm; the nearest "
+        "of these is the neighbour; the six that follow are 0 if there is none",
+        "1",
+        1.0,
+    ),
+    "neighbour_forward": Entry(
+        "position of the neighbour by its last message, forward of the estimated pose", "mm", 500.0
+    ),
+    "neighbour_right": Entry("its position, to the right of the estimated pose", "mm", 500.0),
+    "neighbour_sin_turn": Entry("sine of its heading minus the estimated heading", "1", 1.0),
+    "neighbour_cos_turn": Entry("cosine of its heading minus the estimated heading", "1", 1.0),
+    "neighbour_u_1": Entry("its speed by the last message", "mm/s", 500.0),
+    "neighbour_u_2": Entry("its yaw rate by the last message", "rad/s", 2.0),
+}
+
+
 RAY_MEANING = "distance to the first thing that the ray meets, at most its range"
 
 
@@ -132,14 +152,20 @@ def ray_entries(rays: Rays | None) -> dict[str, Entry]:
     return {f"ray_{i}": one for i in range(rays.count)}
 
 
-def tracking_entries(preview_s: tuple[float, ...], rays: Rays | None = None) -> dict[str, Entry]:
-    """All entries by name, in order; the previews' names carry their time: ``forward_in_0.5_s``."""
+def tracking_entries(
+    preview_s: tuple[float, ...], rays: Rays | None = None, neighbour: Neighbour | None = None
+) -> dict[str, Entry]:
+    """All entries by name, in order; the previews' names carry their time: ``forward_in_0.5_s``.
+
+    Those of a neighbour, if any, come after the previews and before the rays.
+    """
     later = {
         f"{name}_in_{time_s:g}_s": entry
         for time_s in preview_s
         for name, entry in PREVIEW_ENTRIES.items()
     }
-    return TRACKING_ENTRIES | later | ray_entries(rays)
+    heard = {} if neighbour is None else NEIGHBOUR_ENTRIES
+    return TRACKING_ENTRIES | later | heard | ray_entries(rays)
 
 
 @law

@@ -39,6 +39,7 @@ from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import PART_PATTERN
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
+from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.onboard.tracking import Controller, controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.vehicle import RobotParameters
@@ -169,6 +170,8 @@ class Scenario(Frozen):
     residual_reach_mm: Positive | None = None
     observation: Literal["tracking", "sensor"] = "tracking"
     rays: Rays | None = None  # range sensors, at the end of the observation
+    # Hearing beyond the predecessor, in the observation `tracking`; None: only the predecessor is heard.
+    neighbour: Neighbour | None = None
     dtype: Literal["float32", "float64"] = "float32"  # of observations and actions
     preview_s: tuple[NonNegative, ...] = DEFAULT_PREVIEW_S
     reward: dict[str, Number] = Field(default_factory=lambda: FrozenDict(DEFAULT_WEIGHTS._asdict()))
@@ -261,6 +264,10 @@ class Scenario(Frozen):
             raise ValueError(
                 f"rays.period_s {between_s} must be a multiple of control_period_s "
                 f"{self.control_period_s}, at most {MAX_STEPS} of them"
+            )
+        if self.neighbour is not None and self.observation != "tracking":
+            raise ValueError(
+                f"neighbour needs observation 'tracking', which has its entries, got {self.observation!r}"
             )
         if len(set(self.preview_s)) < len(self.preview_s):
             raise ValueError(f"preview_s {self.preview_s} must not contain a time twice")

@@ -63,7 +63,7 @@ def read_law(law: str, parameters: str) -> LawFile:
 
 
 def law_of(law: str, file: LawFile, scenario: Scenario) -> Law:
-    """A law of :data:`LAWS` with its parameters, for a scenario's previews, rays and control period.
+    """A law of :data:`LAWS` with its parameters, for a scenario's observation and control period.
 
     Raises
     ------
@@ -72,14 +72,20 @@ def law_of(law: str, file: LawFile, scenario: Scenario) -> Law:
     """
     given: dict[str, Any] = file.model_dump(exclude_none=True, exclude={"found"})
     bounds = ErrorBounds(**{name: given.pop(name) for name in BOUNDS if name in given})
-    made = LAWS[law][0](scenario.preview_s, rays=scenario.rays, bounds=bounds, **given)
+    made = LAWS[law][0](
+        scenario.preview_s,
+        rays=scenario.rays,
+        neighbour=scenario.neighbour,
+        bounds=bounds,
+        **given,
+    )
     made.period_s = scenario.control_period_s
     made.files = (Path(inspect.getfile(shared)),)
     return made
 
 
 def make_law(law: str, parameters: str, scenario: Scenario) -> Law:
-    """A law by its name, for a scenario's previews, rays and control period.
+    """A law by its name, for a scenario's observation and control period.
 
     Parameters
     ----------

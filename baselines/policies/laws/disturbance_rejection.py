@@ -10,6 +10,7 @@ from baselines.policies.laws.law import UNBOUNDED, ErrorBounds, LawFile, Remembe
 from tlf_env.common.models import Positive
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.rays import Rays
+from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
 NEEDED = (
@@ -86,9 +87,10 @@ class DisturbanceRejection(Remembering):
         most_slip_mm_s: float = 120.0,
         most_slip_rad_s: float = 0.9,
         rays: Rays | None = None,
+        neighbour: Neighbour | None = None,
         bounds: ErrorBounds = UNBOUNDED,
     ) -> None:
-        super().__init__(preview_s, rays, bounds)
+        super().__init__(preview_s, rays, neighbour, bounds)
         self.ahead_mm, self.gain_per_s = ahead_mm, gain_per_s
         self.bandwidth_rad_s = bandwidth_rad_s
         self.most_slip_mm_s, self.most_slip_rad_s = most_slip_mm_s, most_slip_rad_s

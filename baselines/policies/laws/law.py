@@ -20,6 +20,7 @@ from tlf_env.onboard.limiter import (
     twist_limits_row,
 )
 from tlf_env.onboard.rays import Rays
+from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S
@@ -86,15 +87,20 @@ class Law(ABC):
         self,
         preview_s: tuple[float, ...],
         rays: Rays | None,
+        neighbour: Neighbour | None,
         bounds: ErrorBounds,
     ) -> None:
-        entries = tracking_entries(preview_s, rays)
+        entries = tracking_entries(preview_s, rays, neighbour)
         self._places = {name: i for i, name in enumerate(entries)}
         self.scales = np.array([entry.scale for entry in entries.values()])
         self._preview_s = preview_s
         self._bounds: TwistLimitsRow | None = None
         if bounds != UNBOUNDED:
             self._bounds = twist_limits_row(TwistLimits(**bounds.model_dump()), 1.0)
+
+    def place(self, entry: str) -> int:
+        """The place of an entry in the observation; −1 if it has none."""
+        return self._places.get(entry, -1)
 
     @abstractmethod
     def advance(
@@ -127,8 +133,8 @@ class Law(ABC):
         Raises
         ------
         ValueError
-            if the observation does not have the entries of ``tracking`` with this policy's previews and
-            rays, or the state is not that of a call with as many rows.
+            if the observation does not have the entries of ``tracking`` with this policy's previews, rays
+            and neighbour, or the state is not that of a call with as many rows.
         """
         observation = np.asarray(observation)
         if observation.ndim not in (1, 2) or observation.shape[-1] != len(self.scales):

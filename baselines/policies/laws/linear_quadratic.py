@@ -8,6 +8,7 @@ from baselines.policies.laws.law import UNBOUNDED, ErrorBounds, LawFile, Memoryl
 from tlf_env.common.models import Positive
 from tlf_env.numerics.compiled import block, driver
 from tlf_env.onboard.rays import Rays
+from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
 
@@ -66,9 +67,10 @@ class LinearQuadratic(Memoryless):
         horizon_s: float = 3.0,
         step_s: float = 0.03,
         rays: Rays | None = None,
+        neighbour: Neighbour | None = None,
         bounds: ErrorBounds = UNBOUNDED,
     ) -> None:
-        super().__init__(preview_s, rays, bounds)
+        super().__init__(preview_s, rays, neighbour, bounds)
         if horizon_s < step_s:
             raise ValueError(f"horizon_s {horizon_s:g} must be at least step_s {step_s:g}")
         self.error_weights = np.array([forward_mm, lateral_mm, heading_rad]) ** -2.0

@@ -11,6 +11,7 @@ from pydantic import Field
 from baselines.policies.laws.law import UNBOUNDED, ErrorBounds, LawFile, Remembering
 from tlf_env.common.models import NonNegative, Positive, Whole
 from tlf_env.onboard.rays import Rays
+from tlf_env.onboard.supervisor import Neighbour
 
 PREVIEW_S = (0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1.0)
 NODE = ("forward", "right", "sin_turn", "cos_turn", "u_1", "u_2")
@@ -114,9 +115,10 @@ class Predictive(Remembering):
         free_speed_mm_s: float = 130.0,
         free_reach_mm: float = 27.0,
         rays: Rays | None = None,
+        neighbour: Neighbour | None = None,
         bounds: ErrorBounds = UNBOUNDED,
     ) -> None:
-        super().__init__(preview_s, rays, bounds)
+        super().__init__(preview_s, rays, neighbour, bounds)
         casadi_package()
         if not preview_s or preview_s[0] <= 0 or any(np.diff(preview_s) <= 0):
             raise ValueError(

@@ -7,6 +7,7 @@ import numpy as np
 from baselines.policies.laws.law import UNBOUNDED, ErrorBounds, LawFile, Memoryless, angles
 from tlf_env.common.models import Positive
 from tlf_env.onboard.rays import Rays
+from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
 
@@ -62,9 +63,10 @@ class SlidingMode(Memoryless):
         turn_reach_rad_s: float = 1.0,
         turn_layer_rad: float = 0.2,
         rays: Rays | None = None,
+        neighbour: Neighbour | None = None,
         bounds: ErrorBounds = UNBOUNDED,
     ) -> None:
-        super().__init__(preview_s, rays, bounds)
+        super().__init__(preview_s, rays, neighbour, bounds)
         self.heading_weight, self.lateral_scale_mm = heading_weight, lateral_scale_mm
         self.forward_reach_mm_s, self.forward_layer_mm = forward_reach_mm_s, forward_layer_mm
         self.turn_reach_rad_s, self.turn_layer_rad = turn_reach_rad_s, turn_layer_rad

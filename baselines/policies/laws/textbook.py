@@ -10,6 +10,7 @@ from baselines.policies.laws.law import UNBOUNDED, ErrorBounds, LawFile, Memoryl
 from tlf_env.common.models import Positive
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.rays import Rays
+from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.onboard.tracking import linearised_twist
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
@@ -38,9 +39,10 @@ class PurePursuit(Memoryless):
         preview_s: tuple[float, ...] = DEFAULT_PREVIEW_S,
         gain_per_s: float = 0.23,
         rays: Rays | None = None,
+        neighbour: Neighbour | None = None,
         bounds: ErrorBounds = UNBOUNDED,
     ) -> None:
-        super().__init__(preview_s, rays, bounds)
+        super().__init__(preview_s, rays, neighbour, bounds)
         if not preview_s or preview_s[0] <= 0:
             raise ValueError(
                 f"pure pursuit needs a first preview above 0, got preview_s {preview_s}"
@@ -93,9 +95,10 @@ class FeedbackLinearisation(Memoryless):
         ahead_mm: float = 150.0,
         gain_per_s: float = 1.0,
         rays: Rays | None = None,
+        neighbour: Neighbour | None = None,
         bounds: ErrorBounds = UNBOUNDED,
     ) -> None:
-        super().__init__(preview_s, rays, bounds)
+        super().__init__(preview_s, rays, neighbour, bounds)
         self.ahead_mm = ahead_mm
         self.gain_per_s = gain_per_s
 
@@ -136,9 +139,10 @@ class Kanayama(Memoryless):
         k_y_per_mm2: float = 6.4e-5,
         k_theta_per_mm: float | None = None,
         rays: Rays | None = None,
+        neighbour: Neighbour | None = None,
         bounds: ErrorBounds = UNBOUNDED,
     ) -> None:
-        super().__init__(preview_s, rays, bounds)
+        super().__init__(preview_s, rays, neighbour, bounds)
         self.k_x_per_s = k_x_per_s
         self.k_y_per_mm2 = k_y_per_mm2
         critical = 2.0 * math.sqrt(k_y_per_mm2)
