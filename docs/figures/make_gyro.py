@@ -76,8 +76,19 @@ COLUMNS: dict[str, dict[str, Any]] = {
 }
 
 
-# Sensors, motors, robots and floors, on the systems of these estimators.
-OTHERS = ("ekf-slip", "ekf-gyro-smoothed", "truth")
+def slippery(friction_scale: float) -> list[dict[str, float]]:
+    """The patches of the preset, with another friction."""
+    patches = read_preset_or_file("disturbance", "patches")["tyre"]["patches"]
+    return [patch | {"friction_scale": friction_scale} for patch in patches]
+
+
+# Sensors, motors, robots and floors, on systems of these estimators and limiters.
+OTHERS = {
+    "`ekf-slip`": "ekf-slip+body",
+    "`ekf-gyro-smoothed`": "ekf-gyro-smoothed+body",
+    "`ekf-gyro-smoothed+slippery`": "ekf-gyro-smoothed+slippery",
+    "`truth`": "truth+body",
+}
 SLOW_START = {"start_ramp_s": 6.0}
 CONDITIONS: dict[str, dict[str, Any]] = {
     "encoders of 4096 counts, with velocity observer": {
@@ -93,6 +104,8 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     "friction × 0.4": {"disturbance": {"tyre": {"friction_scale": 0.4}}, **SLOW_START},
     "friction × 0.35": {"disturbance": {"tyre": {"friction_scale": 0.35}}, **SLOW_START},
     "`patches` (× 0.4), start within 6 s": {"disturbance": "patches", **SLOW_START},
+    "patches × 0.3": {"disturbance": {"tyre": {"patches": slippery(0.3)}}, **SLOW_START},
+    "`slip`": {"disturbance": "slip"},
 }
 
 
@@ -103,9 +116,9 @@ def one(row: str, column: str, seeds: range) -> str:
     return cell((f"{LAW}+{estimator}+body", {}), {"disturbance": disturbance, **fields}, seeds)
 
 
-def other(estimator: str, condition: str, seeds: range) -> str:
+def other(system: str, condition: str, seeds: range) -> str:
     """A cell of the table of other conditions."""
-    return cell((f"{LAW}+{estimator}+body", {}), CONDITIONS[condition], seeds)
+    return cell((f"{LAW}+{OTHERS[system]}", {}), CONDITIONS[condition], seeds)
 
 
 def table(
