@@ -79,7 +79,7 @@ def test_no_neutral_value_ever_changes():
 def test_today_every_other_default_is_neutral():
     """Where a default is changed on purpose, leave the table alone and name the field here."""
     found = difference(Scenario.model_validate(ROUND))
-    changed = {"estimator", "ekf_gyro", "broadcast_smoothing_s", "residual_base"}
+    changed = {"estimator", "broadcast_smoothing_s", "residual_base"}
     assert set(found) == {"name", "trajectory", "disturbance"} | changed
     assert found["trajectory"] == ROUND["trajectory"]
     assert found["disturbance"] == {"name": "custom"}

@@ -478,7 +478,7 @@ def test_a_supervised_system_asks_for_its_neighbour_and_needs_it(controller):
     scenario = load_scenario("infinity", robots=4)
     fitted = fit_policy(name, scenario)
     assert fitted.scenario.neighbour == Neighbour()
-    assert set(fitted.overrides) == {"neighbour", "estimator"}
+    assert set(fitted.overrides) == {"neighbour", "estimator", "broadcast_smoothing_s"}
     own = load_scenario("infinity", robots=4, neighbour={"range_mm": 900.0})
     assert fit_policy(name, own).scenario.neighbour == Neighbour(range_mm=900.0)
     path = {"type": "circle", "radius_mm": 800.0, "speed_mm_s": 200.0}

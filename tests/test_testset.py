@@ -176,7 +176,9 @@ def test_the_test_set_is_resumed_and_scored(tmp_path, short, monkeypatch):
         run_bench(plan, tmp_path)
     results = run_bench(plan, tmp_path)
     assert [episode.seed for episode in run] == [20_000, 20_000, 20_001, 20_001, 20_001]
-    assert len({found["scenario_hash"] for found in results.ordered()}) == 2
+    for policy in POLICIES:
+        driven = [one for one in results.ordered() if one["policy"] == policy]
+        assert len({one["scenario_hash"] for one in driven}) == len(driven) == 2
     board = write_test_board(results, tmp_path, "tlf bench")
     # The score again, from runs.jsonl alone, by the formula of the page.
     for entry in board["entries"]:
