@@ -75,8 +75,13 @@ def test_an_observation_entry_takes_at_most_two_files():
     assert len({edit.path for edit in of("An observation entry")}) <= 2
 
 
-def test_a_quantity_on_board_takes_two_edits():
-    assert len(of("A quantity on board")) == 2
+def test_a_quantity_on_board_takes_edits_in_two_files():
+    """A row in the layout; its place in a tile and its law."""
+    assert [Path(edit.path).name for edit in of("A quantity on board")] == [
+        "layout.py",
+        "tiles.py",
+        "tiles.py",
+    ]
 
 
 # What is the same with and without the edits: draws, infos, rewards, the actions of shipped policies, and

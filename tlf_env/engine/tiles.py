@@ -510,8 +510,8 @@ def measure(tile: np.ndarray, needs: Needs, dt: float) -> None:
 @law
 def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> None:
     """Wheel speeds and estimators."""
-    for i in range(WIDTH):
-        if estimator == EKF_GYRO:
+    if estimator == EKF_GYRO:
+        for i in range(WIDTH):
             sensors, estimate, slip, found, trace, sample = sense_with_gyro(
                 body_of(tile, i),
                 belief_of(tile, i),
@@ -527,27 +527,33 @@ def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> Non
                 trace_of(tile, i),
                 dt,
             )
+            set_sensors(tile, i, sensors)
+            set_estimate(tile, i, estimate)
+            set_slip(tile, i, slip)
             set_gyro(tile, i, found)
-        else:
-            sensors, estimate, slip, trace, sample = sense_robot(
-                body_of(tile, i),
-                belief_of(tile, i),
-                ekf_of(tile, i),
-                slip_ekf_of(tile, i),
-                motion_of(tile, i),
-                reading_of(tile, i),
-                fix_of(tile, i),
-                yaw_rate_of(tile, i),
-                commanded_of(tile, i),
-                sensors_of(tile, i),
-                estimate_of(tile, i),
-                slip_of(tile, i),
-                trace_of(tile, i),
-                order_of(tile, i),
-                substep,
-                estimator,
-                dt,
-            )
+            set_trace(tile, i, trace)
+            set_sample(tile, i, sample)
+        return
+    for i in range(WIDTH):
+        sensors, estimate, slip, trace, sample = sense_robot(
+            body_of(tile, i),
+            belief_of(tile, i),
+            ekf_of(tile, i),
+            slip_ekf_of(tile, i),
+            motion_of(tile, i),
+            reading_of(tile, i),
+            fix_of(tile, i),
+            yaw_rate_of(tile, i),
+            commanded_of(tile, i),
+            sensors_of(tile, i),
+            estimate_of(tile, i),
+            slip_of(tile, i),
+            trace_of(tile, i),
+            order_of(tile, i),
+            substep,
+            estimator,
+            dt,
+        )
         set_sensors(tile, i, sensors)
         set_estimate(tile, i, estimate)
         set_slip(tile, i, slip)
