@@ -15,6 +15,7 @@ pytest.importorskip("optuna")
 
 from baselines.cli import main
 from baselines.policies.laws.catalogue import LAWS
+from baselines.policies.laws.law import BOUNDS
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.registry import fit_policy
 from baselines.runs.run import run_seeds
@@ -560,15 +561,29 @@ def test_a_search_from_a_system_without_a_part_keeps_it_off(tmp_path):
         assert scenario.ekf_slip.most_acceleration_mm_s2 is None
 
 
-@pytest.mark.parametrize("name", LAWS)
+@pytest.mark.parametrize("name", [*LAWS, "paper"])
 def test_every_law_has_a_search_with_the_tasks_and_the_budget_of_all(name):
     if name == "nmpc":
         pytest.importorskip("casadi")
-    settings, shared = load_tune(name), load_tune("tuned")
-    assert settings.start.law == name
+    settings, shared = load_tune(name), load_tune("feedback_linearisation")
     own = {"start", "search"}
     assert settings.model_dump(exclude=own) == shared.model_dump(exclude=own)
-    assert all(path.startswith("law.") for path in settings.search)
+    if name == "paper":
+        before = settings.start.limits.model_dump(exclude=set(BOUNDS))
+        assert before == controller("linearised").limits.model_dump(exclude=set(BOUNDS))
+    else:
+        assert settings.start.law == name
+    searched = ("law.", "gains.", *(f"limits.{bound}" for bound in BOUNDS))
+    assert all(path.startswith(searched) for path in settings.search)
+
+
+def test_a_controller_is_searched_with_the_broadcasts_of_its_system():
+    settings = load_tune("paper")
+    assert settings.broadcast_smoothing_s > 0
+    for scenario in settings.scenarios(None).values():
+        assert scenario.broadcast_smoothing_s == settings.broadcast_smoothing_s
+    made = settings.built(settings.start_values)
+    assert (made.estimator, made.broadcast_smoothing_s) == ("ekf-gyro", 0.1)
 
 
 @pytest.mark.parametrize(
@@ -576,8 +591,8 @@ def test_every_law_has_a_search_with_the_tasks_and_the_budget_of_all(name):
     [
         ({"start": "feedback+ekf-slip+body"}, "controller 'feedback'"),
         (
-            {"start": "reference:tuned+ekf-slip-smoothed", "search": SMALL["search"]},
-            "a controller is searched without smoothed broadcasts",
+            {"start": "reference:tuned+ekf-slip-without-jumps", "search": SMALL["search"]},
+            "a controller is searched with the parameters of 'ekf-slip', not with those of 'ekf-slip-w",
         ),
         ({"start": "kanayama+ukf+body"}, "estimator 'ukf' is a Python object; a search runs on"),
         ({"start": "kanayama:no_such"}, "kanayama 'no_such' is not one of bounded"),

@@ -108,6 +108,7 @@ class TuneConfig(Frozen):
 
     start: Controller | LawStart  # or the name of a controller, a law or a system; the first trial
     estimator: EstimatorKind = "ekf-slip"
+    broadcast_smoothing_s: NonNegative = 0.0
     ekf_slip: SlipEkfParameters = SlipEkfParameters()
     search: dict[str, Range] = Field(min_length=1)
     tasks: tuple[str, ...] = Field(min_length=1)
@@ -134,13 +135,13 @@ class TuneConfig(Frozen):
                 raise ValueError(f"start.{one_line(error, kind)}") from error
         if not isinstance(given, str):
             return values
-        start, estimator = named_start(given)
-        given = values.get("estimator", estimator)
-        if estimator is not None and given != estimator:
-            raise ValueError(
-                f"start {values['start']!r} names the estimator {estimator!r}; estimator is {given!r}"
-            )
-        return {**values, "start": start} | ({} if given is None else {"estimator": given})
+        start, fields = named_start(given)
+        for key, named in fields.items():
+            if values.get(key, named) != named:
+                raise ValueError(
+                    f"start {given!r} names the {key} {named!r}; {key} is {values[key]!r}"
+                )
+        return {**values, **fields, "start": start}
 
     @field_validator("seeds", "choose", mode="after")
     @classmethod
@@ -256,7 +257,7 @@ class TuneConfig(Frozen):
                     "controller": tree,
                     "estimator": self.estimator,
                     "ekf_slip": slip,
-                    "broadcast_smoothing_s": 0.0,
+                    "broadcast_smoothing_s": self.broadcast_smoothing_s,
                 }
             )
         except ValidationError as error:
@@ -295,7 +296,7 @@ class TuneConfig(Frozen):
                     plant="batch",
                     **{
                         "estimator": self.estimator,
-                        "broadcast_smoothing_s": 0.0,
+                        "broadcast_smoothing_s": self.broadcast_smoothing_s,
                         "ekf_slip": None if ekf_slip is None else ekf_slip.model_dump(),
                         **asked,
                     },
@@ -342,7 +343,8 @@ def _read(source: str, before: tuple[str, ...]) -> dict[str, Any]:
     others = _read(other, (*before, source))
     start = found.get("start")
     if isinstance(start, str) and parse_system(start) is not None:
-        others.pop("estimator", None)  # the system names its own
+        for key in ("estimator", "broadcast_smoothing_s"):  # the system names its own
+            others.pop(key, None)
     return others | found
 
 

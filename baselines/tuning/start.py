@@ -88,7 +88,7 @@ class Named(NamedTuple):
     """What a name stands for."""
 
     start: Any  # a Controller, or a LawStart
-    estimator: str | None  # the one that the name has, if any
+    fields: dict[str, Any]  # of the search that the name sets: estimator and smoothing of a system
 
 
 def _not_searched(estimator: str) -> str:
@@ -135,7 +135,8 @@ def named_start(name: str) -> Named:
     named = system.estimator or None
     if named in PYTHON_ESTIMATORS:
         raise ValueError(f"start {name!r}: {_not_searched(named)}")
-    estimator = None if named is None else str(ESTIMATORS[named]["estimator"])
+    asked = {} if named is None else ESTIMATORS[named]
+    fields = {key: asked[key] for key in ("estimator", "broadcast_smoothing_s") if key in asked}
     if head in LAWS:
         given = read_law(head, tail).model_dump(exclude={"found"})
         given |= {key: _default(head, key) for key, value in given.items() if value is None}
@@ -143,15 +144,15 @@ def named_start(name: str) -> Named:
         made = LawStart(
             law=head, parameters=given, limiter=system.limiter, estimator=named, **limits
         )
-        return Named(made, estimator)
-    if estimator is None:
-        return Named(controller(name), None)
-    if named != estimator:
+        return Named(made, fields)
+    if not asked:
+        return Named(controller(name), {})
+    if asked != fields:
         raise ValueError(
-            f"start {name!r}: a controller is searched without smoothed broadcasts, and with the parameters "
-            f"of {estimator!r} that it finds itself"
+            f"start {name!r}: a controller is searched with the parameters of {fields['estimator']!r}, not "
+            f"with those of {named!r}"
         )
     if limiter is not None and limiter.supervisor is not None:
         raise ValueError(f"start {name!r}: a controller is searched without a supervisor")
     known = controller(tail or DEFAULT_CONTROLLER) if head == "reference" else controller(head)
-    return Named(behind(known, limiter or own_limiter(known)), estimator)
+    return Named(behind(known, limiter or own_limiter(known)), fields)
