@@ -283,7 +283,7 @@ def speed(
 
 
 PLAN_OPTIONS = frozenset(
-    ("policies", "tasks", "disturbances", "seeds", "level", "sweep", "horizon_s", "plant")
+    ("policies", "tasks", "disturbances", "also", "seeds", "level", "sweep", "horizon_s", "plant")
 )
 
 
@@ -312,6 +312,13 @@ def bench(
     disturbances: Annotated[
         str, typer.Option(help="Disturbances, comma-separated: presets or FILE.yaml; or all.")
     ] = "all",
+    also: Annotated[
+        str,
+        typer.Option(
+            help="TASK:DISTURBANCE, comma-separated: pairs that are run beside all pairs of --tasks and "
+            "--disturbances."
+        ),
+    ] = "",
     seeds: Annotated[
         str, typer.Option(help="Seeds FIRST:END; END itself is not run.")
     ] = "20000:20050",
@@ -359,9 +366,9 @@ def bench(
     plan: Annotated[
         str | None,
         typer.Option(
-            help="Read policies, tasks, disturbances, seeds, level, sweep, horizon and plant from a plan: "
-            "board, unseen or FILE.yaml; command-line options take "
-            "precedence.",
+            help="Read policies, tasks, disturbances, also, seeds, level, sweep, horizon and plant from a "
+            "plan: board, controllers, crossing, crossing-slow, unseen or FILE.yaml; command-line options "
+            "take precedence.",
             is_eager=True,
             callback=take_plan,
         ),
@@ -418,7 +425,13 @@ def bench(
         return
     out = out or Path("results/bench")
     from baselines.benchmark.bench import named_scenarios, run_bench
-    from baselines.benchmark.plan import Plan, disturbance_presets, parse_seeds, parse_sweep
+    from baselines.benchmark.plan import (
+        Plan,
+        disturbance_presets,
+        parse_pairs,
+        parse_seeds,
+        parse_sweep,
+    )
     from baselines.runs.provenance import command_line
     from baselines.tables import board_table
 
@@ -429,6 +442,7 @@ def bench(
         disturbances=tuple(disturbance_presets())
         if disturbances == "all"
         else listed(disturbances),
+        also=parse_pairs(also),
         seeds=parse_seeds(seeds),
         level=level,
         sweep=path,
@@ -468,7 +482,7 @@ def refuse_beside_test(ctx: typer.Context) -> None:
     ValueError
         naming the first option.
     """
-    for option in ("tasks", "disturbances", "level", "sweep", "horizon_s", "plant"):
+    for option in ("tasks", "disturbances", "also", "level", "sweep", "horizon_s", "plant"):
         if given(ctx, option):
             raise ValueError(
                 f"--{option.replace('_', '-')} cannot be used with --test: every case has its own"

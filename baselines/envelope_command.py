@@ -36,7 +36,7 @@ from baselines.runs.provenance import command_line
 
 SEEDS = "20000:20100"
 OUT = Path("results/envelope")
-OTHERS = ("disturbances", "level", "sweep")  # options that an envelope has no use for
+OTHERS = ("disturbances", "also", "level", "sweep")  # options that an envelope has no use for
 
 
 def bench_envelope(ctx: typer.Context, policies: tuple[str, ...]) -> None:

@@ -17,7 +17,7 @@ pytest.importorskip("arch")
 from baselines.benchmark import bench
 from baselines.benchmark.aggregate import leaderboard, write_leaderboard
 from baselines.benchmark.bench import run_bench
-from baselines.benchmark.plan import Episode, Plan, parse_seeds, parse_sweep
+from baselines.benchmark.plan import Episode, Plan, parse_pairs, parse_seeds, parse_sweep, read_plan
 from baselines.benchmark.results import RUNS_FILE
 from baselines.cli import main
 from baselines.runs.nested import value_at, with_value
@@ -349,12 +349,17 @@ def test_seeds_of_another_form_are_reported(text):
         ("--sweep tyre.friction_scale=1:-1:3", "friction_scale"),
         ("--disturbances nominal,ice --sweep level=0:3:4", "friction_scale"),
         ("--sweep slip.delta_1_mm_s=nan:1:2", "delta_1_mm_s"),
+        ("--also infinity", "also 'infinity' must be TASK:DISTURBANCE"),
+        ("--also no_such:ice", "no_such"),
+        ("--also infinity:no_such", "no_such"),
+        ("--plan crossed.yaml", "policies.limiters is None"),
+        ("--plan wider.yaml", "policies.tasks is ['infinity']"),
         ("--seeds 5", "FIRST:END"),
         ("--seeds 0:99999999999999999999999", "seed"),
         ("--level -1", "level"),
         ("--horizon-s 0.03", "horizon_s"),
         ("--processes -1", "processes"),
-        ("--plan no_such", "not one of board, unseen, nor a .yaml file"),
+        ("--plan no_such", "not one of board, controllers, crossing, crossing-slow, unseen, nor"),
         ("--plan no_such.yaml", "no_such.yaml"),
         ("--plan trusting.yaml", "'trust'"),
         ("--plan nested.yaml", "seeds must be a text, a number or a list"),
@@ -367,6 +372,11 @@ def test_bad_input_is_one_line_and_writes_nothing(words, said, tmp_path, monkeyp
     )
     (tmp_path / "trusting.yaml").write_text("trust: true\n")
     (tmp_path / "nested.yaml").write_text("seeds: {first: 1}\n")
+    crossed = "controllers: [kanayama], estimators: [ekf]"
+    (tmp_path / "crossed.yaml").write_text(f"policies: {{{crossed}}}\n")
+    (tmp_path / "wider.yaml").write_text(
+        f"policies: {{{crossed}, limiters: [none], tasks: [infinity]}}\n"
+    )
     (tmp_path / "wordy.yaml").write_text("horizon_s: long\n")
     monkeypatch.chdir(tmp_path)
     defaults = {"--policies": "pure_pursuit", "--tasks": "infinity", "--disturbances": "nominal"}
@@ -433,3 +443,23 @@ def test_the_figures_are_drawn_from_what_the_table_holds(tmp_path):
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in written)
     assert knob_label("slip.delta_1_mm_s") == "slip.delta_1 (mm/s)"
     assert knob_label("level") == "level"
+
+
+def test_a_plan_crosses_parts_and_adds_pairs(tmp_path):
+    from baselines.cli import PLAN_OPTIONS
+
+    path = tmp_path / "plan.yaml"
+    path.write_text(
+        "policies: {controllers: [kanayama, 'reference:tuned'], estimators: [ekf], limiters: [none, body]}\n"
+        "also: ['infinity:ice', 'circle:slip']\n"
+    )
+    options = read_plan(str(path), PLAN_OPTIONS)
+    assert options["policies"] == (
+        "kanayama+ekf+none,kanayama+ekf+body,reference:tuned+ekf+none,reference:tuned+ekf+body"
+    )
+    plan = Plan(
+        ("kanayama",), ("infinity",), ("nominal", "ice"), (0, 2), also=parse_pairs(options["also"])
+    )
+    places = [("infinity", "nominal"), ("infinity", "ice"), ("circle", "slip")]
+    assert list(plan.places) == places  # each once
+    assert [(one.task, one.disturbance) for one in plan.episodes()] == 2 * places

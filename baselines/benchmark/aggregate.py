@@ -175,21 +175,20 @@ def breaking_points(results: Results, cells: list[dict[str, Any]]) -> list[dict[
     nominal = nominals.get(results.plan.sweep, 0.0)
     out = []
     for policy in results.plan.policies:
-        for task in results.plan.tasks:
-            for disturbance in results.plan.disturbances:
-                mine = [
-                    cell
-                    for cell in cells
-                    if (cell["policy"], cell["task"], cell["disturbance"])
-                    == (policy, task, disturbance)
-                ]
-                mine.sort(key=lambda cell: abs(cell["sweep"] - nominal))
-                shares = [1 - cell["success"]["share"] for cell in mine]
-                values = [cell["sweep"] for cell in mine]
-                row: dict[str, Any] = {"policy": policy, "task": task, "disturbance": disturbance}
-                for loss in LOSSES:
-                    row[f"loses_{100 * loss:g}_percent_at"] = crossing(values, shares, loss)
-                out.append(row)
+        for task, disturbance in results.plan.places:
+            mine = [
+                cell
+                for cell in cells
+                if (cell["policy"], cell["task"], cell["disturbance"])
+                == (policy, task, disturbance)
+            ]
+            mine.sort(key=lambda cell: abs(cell["sweep"] - nominal))
+            shares = [1 - cell["success"]["share"] for cell in mine]
+            values = [cell["sweep"] for cell in mine]
+            row: dict[str, Any] = {"policy": policy, "task": task, "disturbance": disturbance}
+            for loss in LOSSES:
+                row[f"loses_{100 * loss:g}_percent_at"] = crossing(values, shares, loss)
+            out.append(row)
     return out
 
 

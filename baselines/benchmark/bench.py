@@ -74,24 +74,22 @@ def named_scenarios(plan: Plan) -> list[tuple[str, Scenario]]:
         as :meth:`Plan.scenario` and :func:`~baselines.policies.registry.fit_policy`.
     """
     named = []
-    for task in plan.tasks:
-        asked: dict[str, dict[str, Any]] = {}
-        for disturbance in plan.disturbances:
-            for value in plan.values:
-                episode = Episode("", task, disturbance, plan.level, value, plan.seeds[0])
-                scenario = plan.scenario(episode)
-                for policy in plan.policies:
-                    if policy not in asked:
-                        fitted = fit_policy(policy, scenario, trust=plan.trust)
-                        asked[policy] = fitted.overrides
-                    named.append(
-                        (f"{task}, {disturbance}", load_scenario(scenario, **asked[policy]))
-                    )
+    asked: dict[tuple[str, str], dict[str, Any]] = {}
+    for task, disturbance in plan.places:
+        for value in plan.values:
+            episode = Episode("", task, disturbance, plan.level, value, plan.seeds[0])
+            scenario = plan.scenario(episode)
+            for policy in plan.policies:
+                if (task, policy) not in asked:
+                    fitted = fit_policy(policy, scenario, trust=plan.trust)
+                    asked[task, policy] = fitted.overrides
+                changed = load_scenario(scenario, **asked[task, policy])
+                named.append((f"{task}, {disturbance}", changed))
     return named
 
 
 def blocks(plan: Plan, episodes: Sequence[Episode]) -> list[tuple[Episode, ...]]:
-    """Episodes that are run and written together: one by one, or on the batch plant up to 25 seeds.
+    """Episodes that are run and written together: one by one, or on the batch plant up to 50 seeds.
 
     A block's episodes differ in their seeds only. Blocks come in the order of their first episodes.
     """

@@ -177,6 +177,13 @@ class Grid(NamedTuple):
         """Places of the levels that are tested in any case."""
         return list(range(0, len(self.levels), self.coarse))
 
+    @property
+    def usual(self) -> float:
+        """The largest of these levels up to 1, at which the disturbance is as its file has it; or the first."""
+        return max(
+            (one for i in self.first if (one := self.levels[i]) <= 1), default=self.levels[0]
+        )
+
 
 def grid(levels: tuple[float, float], resolution: float) -> Grid:
     """A geometric grid whose neighbours differ by at most ``resolution``, e.g. 0.05.

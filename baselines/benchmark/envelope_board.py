@@ -3,6 +3,9 @@
 The score of a system is the geometric mean of its envelopes, in levels, over all knobs and tasks. Level 1 is
 the disturbance as the knob's file has it, so a score of 2 is twice these disturbances. An envelope below the
 first level of a knob counts as the first level, one beyond the last as the last.
+
+What a system spends is beside the score: energy, torque and time gap at the usual level of each knob, the
+largest one up to 1 that every system runs.
 """
 
 from __future__ import annotations
@@ -16,9 +19,9 @@ from typing import Any
 import numpy as np
 from scipy.stats import binom
 
-from baselines.benchmark.envelope import CONFIDENCE, HELD_SHARE, Envelope, envelope
-from baselines.benchmark.envelope_runs import PLAN_FILE, EnvelopeResults
-from baselines.benchmark.page import figure_title, policy_label
+from baselines.benchmark.envelope import CONFIDENCE, HELD_SHARE, Envelope, Probe, envelope
+from baselines.benchmark.envelope_runs import COSTS, PLAN_FILE, EnvelopeResults
+from baselines.benchmark.page import figure_title, number, policy_label
 from baselines.benchmark.sweep_figure import unit_of
 from tlf_env.common.files import atomic
 
@@ -40,6 +43,7 @@ def envelope_board(results: EnvelopeResults, command: str = "") -> dict[str, Any
         knob, found = plan.loaded[search.knob], plan.grids[search.knob]
         made = envelope(found, results.failed(search), plan.counts)
         lines = [line for probe, line in results.lines.items() if probe.search == search]
+        usual = results.lines.get(Probe(*search, found.usual), {})
         cells.append(
             {
                 **search._asdict(),
@@ -57,6 +61,8 @@ def envelope_board(results: EnvelopeResults, command: str = "") -> dict[str, Any
                 "privileged": any(line["privileged"] for line in lines),
                 "overrides": lines[0]["overrides"] if lines else {},
                 "tested": len(lines),
+                "usual": found.usual,
+                **{name: usual.get(name) for name in COSTS},
             }
         )
     policies = [policy_row(name, cells) for name in plan.policies]
@@ -91,7 +97,14 @@ def policy_row(policy: str, cells: Sequence[Mapping[str, Any]]) -> dict[str, Any
         "below_first": sum(cell["level"] is None for cell in mine),
         "beyond_last": sum(cell["beyond"] for cell in mine),
         "knobs": len(mine),
+        **{name: middle([cell[name] for cell in mine]) for name in COSTS},
     }
+
+
+def middle(values: Sequence[float | None]) -> float | None:
+    """Median of the values that are not None."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
 
 
 def comparisons(
@@ -157,8 +170,8 @@ def envelope_tables(board: Mapping[str, Any]) -> list[str]:
     names = [row["policy"] for row in board["policies"]]
     parts = [
         "| system | score | knobs below the first level | beyond the last | median ratio to the best | "
-        "larger, smaller |",
-        "|---|---:|---:|---:|---:|---:|",
+        "larger, smaller | energy J | torque RMS N·mm | time gap RMS s |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|---:|",
     ]
     compared = {row["policy"]: row for row in board["comparisons"]}
     for row in board["policies"]:
@@ -166,7 +179,8 @@ def envelope_tables(board: Mapping[str, Any]) -> list[str]:
         signs = "–" if other is None else f"{other['larger']}, {other['smaller']}"
         parts.append(
             f"| {policy_label(dict(row))} | {row['score']:.2f} | {row['below_first']} of {row['knobs']} | "
-            f"{row['beyond_last']} | {ratio_text(other)} | {signs} |"
+            f"{row['beyond_last']} | {ratio_text(other)} | {signs} | {number(row['energy_J'], 2)} | "
+            f"{number(row['torque_rms_Nmm'], 2)} | {number(row['time_gap_rmse_s'], 4)} |"
         )
     for task in dict.fromkeys(cell["task"] for cell in board["cells"]):
         parts += ["", f"Envelopes on `{task}`:", ""]
@@ -255,7 +269,9 @@ def explanation(board: Mapping[str, Any]) -> str:
         "fails if a robot is lost or touches another. In brackets, the "
         f"{100 * CONFIDENCE:.0f} % interval of the level that {100 * HELD_SHARE:.0f} % of all seeds hold: "
         f"{ends[0]}; {ends[1]}. **Bold**: the largest of a row. ↕: a tested level above holds again. Score: "
-        "geometric mean of the envelopes in levels."
+        "geometric mean of the envelopes in levels. Energy of all robots, torque and time gap of the worst: "
+        "medians over the knobs of the medians over the runs, at the largest level up to 1 that every system "
+        "runs."
     )
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -29,11 +29,23 @@ from baselines.runs.outcome import failed
 from baselines.runs.provenance import git_revision, physics_digest, simulation_digest, versions
 from baselines.runs.run import run_seeds, seed_blocks
 from tlf_env.numerics.philox import checked_seed
+from tlf_env.task.metrics import RobotMetrics
 from tlf_env.task.neutral import scenario_hash
 
 LEVELS_FILE, PLAN_FILE = "levels.jsonl", "envelope_plan.json"
 CLAIMED = ("plan", "knobs", "policies", "scenarios", "simulation")
 SECONDS_DIGITS = 2
+COSTS = ("energy_J", "torque_rms_Nmm", "time_gap_rmse_s")  # of a run, beside its error
+
+
+def costs_of(metrics: Sequence[RobotMetrics]) -> dict[str, float]:
+    """Energy of all robots together (J), torque RMS (N·mm) and time gap RMS (s) of the worst robot of a run."""
+    gaps = [robot.time_gap_rmse_s for robot in metrics if robot.time_gap_rmse_s is not None]
+    return {
+        "energy_J": sum(robot.energy_J for robot in metrics),
+        "torque_rms_Nmm": max(robot.torque_rms_Nmm for robot in metrics),
+        "time_gap_rmse_s": max(gaps, default=0.0),
+    }
 
 
 def run_probe(plan: EnvelopePlan, probe: Probe) -> dict[str, Any]:
@@ -45,7 +57,9 @@ def run_probe(plan: EnvelopePlan, probe: Probe) -> dict[str, Any]:
     since = time.process_time()
     fitted = fit_policy(probe.policy, plan.scenario(probe), trust=plan.trust)
     most = plan.counts.held if plan.counts.high is None else plan.counts.high
-    lost, errors, stopped = 0, [], False
+    lost, stopped = 0, False
+    errors: list[float] = []
+    costs: list[dict[str, float]] = []
     for seeds in seed_blocks(range(*plan.seeds)):
         runs = 0
         for record in run_seeds(
@@ -55,6 +69,7 @@ def run_probe(plan: EnvelopePlan, probe: Probe) -> dict[str, Any]:
             metrics = record.metrics()
             lost += failed(metrics)
             errors.append(max(robot.position_rmse_mm or 0.0 for robot in metrics))
+            costs.append(costs_of(metrics))
             if lost > most:
                 break
         if not runs:  # more than most - lost runs of the block have failed
@@ -67,6 +82,10 @@ def run_probe(plan: EnvelopePlan, probe: Probe) -> dict[str, Any]:
         "failed": lost,
         "stopped": stopped,
         "position_rmse_mm": None if stopped else float(np.median(errors)),
+        **{
+            name: None if stopped else float(np.median([run[name] for run in costs]))
+            for name in COSTS
+        },
         "scenario_hash": scenario_hash(fitted.scenario),
         "physics": physics_digest(),
         "privileged": fitted.scenario.privileged

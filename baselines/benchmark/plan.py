@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Collection
 from dataclasses import dataclass
@@ -10,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import SeedRange
-from tlf_env.common.errors import nearest
+from tlf_env.common.errors import nearest, shown
 from tlf_env.common.presets import beside, is_file_name, preset_names, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.task.scenario import Scenario, load_scenario
@@ -44,8 +45,9 @@ class Episode(NamedTuple):
 class Plan:
     """The episodes to be run.
 
-    ``overrides`` are fields of every scenario; ``sweep`` is the path of a knob: a parameter of the disturbance,
-    its ``level``, or a field of the scenario.
+    ``also`` are pairs of a task and a disturbance that are run beside all pairs of ``tasks`` and
+    ``disturbances``. ``overrides`` are fields of every scenario; ``sweep`` is the path of a knob: a parameter
+    of the disturbance, its ``level``, or a field of the scenario.
     """
 
     unrecorded: ClassVar[tuple[str, ...]] = ("trust",)  # a permission, which changes no result
@@ -59,6 +61,13 @@ class Plan:
     sweep_values: tuple[float, ...] = ()
     overrides: tuple[tuple[str, Any], ...] = ()
     trust: bool = False
+    also: tuple[tuple[str, str], ...] = ()
+
+    @property
+    def places(self) -> tuple[tuple[str, str], ...]:
+        """Every pair of a task and a disturbance, in the order of the tables."""
+        pairs = itertools.product(self.tasks, self.disturbances)
+        return tuple(dict.fromkeys((*pairs, *self.also)))
 
     @property
     def values(self) -> tuple[float | None, ...]:
@@ -70,8 +79,7 @@ class Plan:
         return [
             Episode(policy, task, disturbance, self.level, value, seed)
             for seed in range(*self.seeds)
-            for task in self.tasks
-            for disturbance in self.disturbances
+            for task, disturbance in self.places
             for value in self.values
             for policy in self.policies
         ]
@@ -147,6 +155,25 @@ def _values(span: str) -> tuple[float, ...]:
     return tuple(float(f"{first * (last / first) ** share:.{SWEEP_DIGITS}g}") for share in shares)
 
 
+def parse_pairs(text: str) -> tuple[tuple[str, str], ...]:
+    """``task:disturbance,task:disturbance,...`` as pairs; none for an empty text.
+
+    Raises
+    ------
+    ValueError
+        if a part has another form.
+    """
+    pairs = []
+    for part in filter(None, map(str.strip, text.split(","))):
+        task, _, disturbance = part.rpartition(":")
+        if not task or not disturbance:
+            raise ValueError(
+                f"also {part!r} must be TASK:DISTURBANCE, e.g. infinity_hardware:hardware"
+            )
+        pairs.append((task, disturbance))
+    return tuple(pairs)
+
+
 def parse_seeds(text: str) -> SeedRange:
     """``first:end`` as two numbers; ``end`` itself is not run.
 
@@ -163,6 +190,9 @@ def parse_seeds(text: str) -> SeedRange:
 
 def read_plan(name: str, fields: Collection[str]) -> dict[str, Any]:
     """The options of ``tlf bench`` that a plan sets, in the form that the command line has.
+
+    ``policies`` may be a mapping of ``controllers``, ``estimators`` and ``limiters``, which stands for all
+    systems of these parts.
 
     Parameters
     ----------
@@ -188,10 +218,31 @@ def read_plan(name: str, fields: Collection[str]) -> dict[str, Any]:
         if field == "disturbances" and is_file_name(name):
             names = [one.strip() for one in value.split(",")] if isinstance(value, str) else value
             value = beside(Path(name).parent, names)
+        if field == "policies" and isinstance(value, dict):
+            value = crossed(name, value)
         options[field] = ",".join(map(str, value)) if isinstance(value, list) else value
         if isinstance(value, bool) or not isinstance(options[field], str | int | float):
             raise ValueError(f"plan {name!r}: {field} must be a text, a number or a list")
     return options
+
+
+def crossed(plan: str, parts: dict[str, Any]) -> list[str]:
+    """The names of all systems of some controllers, estimators and limiters, by controller first.
+
+    Raises
+    ------
+    ValueError
+        for a missing or an unknown part, or one that is not a list of names.
+    """
+    wanted = ("controllers", "estimators", "limiters")
+    for part in (*wanted, *parts):
+        names = parts.get(part)
+        if part not in wanted or not (names and isinstance(names, list)):
+            raise ValueError(
+                f"plan {plan!r}: policies.{part} is {shown(names)}; policies is a list of names, or a mapping "
+                f"of {', '.join(wanted)} to one list of names each"
+            )
+    return ["+".join(map(str, names)) for names in itertools.product(*(parts[w] for w in wanted))]
 
 
 def disturbance_presets() -> list[str]:

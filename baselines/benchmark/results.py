@@ -21,6 +21,7 @@ from baselines.runs.provenance import (
 from tlf_env.common.files import atomic, parse_json
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.task.neutral import scenario_hash
+from tlf_env.task.scenario import Scenario
 
 KeyT = TypeVar("KeyT")
 
@@ -45,15 +46,14 @@ def plan_record(plan: Plan) -> dict[str, Any]:
     checked_seed(plan.seeds[1] - 1)
     scenarios: dict[str, str] = {}
     policies: dict[str, str | None] = {}
-    for task in plan.tasks:
-        for disturbance in plan.disturbances:
-            for value in plan.values:
-                episode = Episode("", task, disturbance, plan.level, value, plan.seeds[0])
-                place = ", ".join(
-                    (task, disturbance) if value is None else (task, disturbance, f"{value:g}")
-                )
-                scenario = plan.scenario(episode)
-                scenarios[place] = scenario_hash(scenario)
+    last: dict[str, Scenario] = {}  # of each task
+    for task, disturbance in plan.places:
+        for value in plan.values:
+            episode = Episode("", task, disturbance, plan.level, value, plan.seeds[0])
+            swept = () if value is None else (f"{value:g}",)
+            last[task] = plan.scenario(episode)
+            scenarios[", ".join((task, disturbance, *swept))] = scenario_hash(last[task])
+    for scenario in last.values():
         for name in plan.policies:
             policies[name] = policy_hash(name, fit_policy(name, scenario, trust=plan.trust).policy)
     asked = asdict(plan)

@@ -22,7 +22,7 @@ from tlf_env.task.warn import without_warnings
 
 ItemT = TypeVar("ItemT")
 
-SEEDS_PER_BLOCK = 25  # runs side by side: a record takes 2 to 4 MB
+SEEDS_PER_BLOCK = 50  # runs side by side: a record takes 2 to 4 MB
 
 # Columns of a record, in the order of trajectory.csv; each is (time, robot).
 RECORDED = (
@@ -206,7 +206,7 @@ def run_seeds(
 
 
 def seed_blocks(seeds: Sequence[ItemT]) -> Iterator[Sequence[ItemT]]:
-    """Blocks of up to 25 seeds, or of items with one seed each: as many as run side by side."""
+    """Blocks of up to 50 seeds, or of items with one seed each: as many as run side by side."""
     for i in range(0, len(seeds), SEEDS_PER_BLOCK):
         yield seeds[i : i + SEEDS_PER_BLOCK]
 

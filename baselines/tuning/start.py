@@ -26,6 +26,8 @@ from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario
 
+SYSTEM_FIELDS = ("estimator", "broadcast_smoothing_s")  # that a system's name sets in a search
+
 
 class LawStart(Limiter):
     """A tracking law with its parameters, behind a limiter."""
@@ -136,7 +138,7 @@ def named_start(name: str) -> Named:
     if named in PYTHON_ESTIMATORS:
         raise ValueError(f"start {name!r}: {_not_searched(named)}")
     asked = {} if named is None else ESTIMATORS[named]
-    fields = {key: asked[key] for key in ("estimator", "broadcast_smoothing_s") if key in asked}
+    fields: dict[str, Any] = {key: asked[key] for key in SYSTEM_FIELDS if key in asked}
     if head in LAWS:
         given = read_law(head, tail).model_dump(exclude={"found"})
         given |= {key: _default(head, key) for key, value in given.items() if value is None}

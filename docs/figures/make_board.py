@@ -1,8 +1,10 @@
-"""Write ``docs/leaderboard.md``, ``docs/leaderboard/`` and the README's tables from benchmark results.
+"""Write the pages of a leaderboard from benchmark results: whole systems, or controllers alone.
 
 First run ``tlf bench --plan board --out results/board``, then
-``python docs/figures/make_board.py results/board``. This needs the extras ``bench`` and ``figures``.
-The same results give the same files, byte for byte.
+``python docs/figures/make_board.py results/board``: ``docs/leaderboard.md``, ``docs/leaderboard/`` and the
+README's tables. With ``controllers`` in place of ``board`` (and ``--board controllers``):
+``docs/leaderboard-controllers.md`` and its folder. This needs the extras ``bench`` and ``figures``. The
+same results give the same files, byte for byte.
 """
 
 from __future__ import annotations
@@ -23,8 +25,10 @@ from tlf_env.task.scenario import load_scenario
 
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
-README_DISTURBANCES = ("nominal", "noise", "slip", "ice", "start", "combined-hard")
+README_TASKS = ("infinity", "flower")
+README_DISTURBANCES = ("nominal", "slip", "slip-noise", "ice", "start", "combined-hard", "swell")
 TASK_NAMES = {"infinity": "∞", "flower": "Flower"}
+BOARDS = {"board": "leaderboard", "controllers": "leaderboard-controllers"}  # plan: page
 BEGIN, END = "<!-- board -->", "<!-- end of board -->"
 METRIC = "position_rmse_mm"
 
@@ -75,6 +79,7 @@ def plan_of(board: Board) -> Plan:
     return Plan(
         **{name: tuple(plan[name]) for name in ("policies", "tasks", "disturbances", "seeds")},
         level=plan["level"],
+        also=tuple(tuple(pair) for pair in plan.get("also", ())),
         overrides=tuple(tuple(pair) for pair in plan["overrides"]),
     )
 
@@ -90,11 +95,16 @@ def slice_of(board: Board, lines: list[Line]) -> list[Line]:
         for line in lines
         if line["seed"] == plan.seeds[0]
     }
-    places = [(policy, task) for task in plan.tasks for policy in plan.policies]
-    return [
-        first[policy, task, plan.disturbances[k * len(plan.disturbances) // len(places)]]
-        for k, (policy, task) in enumerate(places)
+    rows = [(policy, task) for task in plan.tasks for policy in plan.policies]
+    found = [
+        first[policy, task, plan.disturbances[k * len(plan.disturbances) // len(rows)]]
+        for k, (policy, task) in enumerate(rows)
     ]
+    others = [
+        first[plan.policies[k % len(plan.policies)], task, disturbance]
+        for k, (task, disturbance) in enumerate(plan.also)
+    ]
+    return found + others
 
 
 def failures(cell: dict[str, Any]) -> int:
@@ -152,12 +162,13 @@ def readme_part(board: Board) -> str:
     first, end = plan["seeds"]
     horizon = dict(map(tuple, plan["overrides"])).get("horizon_s")
     length = "" if horizon is None else f" of {horizon:g} s"
-    tables = "\n\n".join(readme_table(board, task) for task in plan["tasks"])
+    tasks = [task for task in README_TASKS if task in plan["tasks"]] or plan["tasks"]
+    tables = "\n\n".join(readme_table(board, task) for task in tasks)
     return (
         f"Position RMS of the worst robot in mm, median over {end - first} runs{length}. In brackets: the "
         "number of *failed* runs (a robot is lost or touches another); if at least half fail, only this "
         "number is given. **Bold**: fewest failures, then smallest error. Score: interquartile mean (IQM) "
-        f"from 0 to 100 over all tasks and {len(plan['disturbances'])} disturbances.\n\n"
+        f"from 0 to 100 over all {len(plan_of(board).places)} pairs of task and disturbance.\n\n"
         f"{tables}\n\n"
         "All disturbances, intervals, and the command that reproduces them: "
         "[docs/leaderboard.md](docs/leaderboard.md)."
@@ -186,8 +197,8 @@ def write_text(path: Path, text: str) -> None:
         file.write(text.encode())
 
 
-def write_board(results: Path, root: Path = ROOT) -> None:
-    """Write all pages under ``root``, the checkout.
+def write_board(results: Path, root: Path = ROOT, name: str = "board") -> None:
+    """Write all pages of one of :data:`BOARDS` under ``root``, the checkout.
 
     Raises
     ------
@@ -195,10 +206,12 @@ def write_board(results: Path, root: Path = ROOT) -> None:
         as in :func:`read_results` and :func:`with_part`, before any file is written.
     """
     board, lines = read_results(results)
-    readme = with_part((root / "README.md").read_text("utf-8"), readme_part(board))
-    folder = root / "docs" / "leaderboard"
+    readme = (root / "README.md").read_text("utf-8")
+    if name == "board":
+        readme = with_part(readme, readme_part(board))
+    folder = root / "docs" / BOARDS[name]
     folder.mkdir(parents=True, exist_ok=True)
-    figures = [f"leaderboard/{path.name}" for path in write_bench_figures(board, folder)]
+    figures = [f"{folder.name}/{path.name}" for path in write_bench_figures(board, folder)]
     write_text(folder / BOARD_FILE, json.dumps(board, indent=1, allow_nan=False) + "\n")
     write_text(
         folder / "slice.jsonl", "".join(json.dumps(line) + "\n" for line in slice_of(board, lines))
@@ -211,10 +224,11 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("results", type=Path, help="output folder of tlf bench")
+    parser.add_argument("--board", choices=BOARDS, default="board", help="which board")
     parser.add_argument("--root", type=Path, default=ROOT, help="checkout to write to")
     options = parser.parse_args()
     try:
-        write_board(options.results, options.root)
+        write_board(options.results, options.root, options.board)
     except ValueError as error:
         sys.exit(f"make_board: {error}")
 
