@@ -12,18 +12,23 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run test test-slow test-learning check check-lowest check-clients format board speed speed-docs constraints clean
+.PHONY: help run compile test test-slow test-learning check check-lowest check-clients format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
 	while IFS='|' read -r target text; do printf '%-20s %s\n' "  $$target" "$$text"; done
 
-run: $(VENV)/.stamp-run ## Run the reference policy on the preset infinity; results in results/infinity
+run: compile ## Run the reference policy on the preset infinity; results in results/infinity
 	$(BIN)/tlf run infinity --out results/infinity
 
+compile: $(VENV)/.stamp-run ## Compile the step drivers, if that was not done before
+	$(BIN)/tlf compile
+
+# Compiled first, because every process of pytest would compile the same drivers otherwise.
 # In the order of their names: the files with the fewest tests, which would come last otherwise, take longest.
-test: check ## Run the checks, then the tests
-	$(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder
+test: $(VENV)/.stamp-test ## Run the checks, and compile meanwhile; then run the tests
+	$(MAKE) -j 2 check compile
+	$(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations=25 --durations-min=5
 
 test-slow: $(VENV)/.stamp-test ## Run the slow tests
 	$(BIN)/pytest -m slow

@@ -649,6 +649,14 @@ def tune(
     screen.print(f"tlf run {search.tasks[0]} {how}", soft_wrap=True)
 
 
+@app.command("compile")
+def compile_() -> None:
+    """Compile the step drivers ahead of the first run, on two cores; nothing is done twice."""
+    from baselines.compile_command import compile_drivers
+
+    compile_drivers()
+
+
 def draw_bench(board: dict[str, Any], folder: Path) -> list[Path]:
     """The benchmark's figures; none, and a note, if matplotlib is missing."""
     try:

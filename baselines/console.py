@@ -82,7 +82,7 @@ def warn_of_compiling() -> None:
 
     folder = cache_folder()
     if folder is None or not any(folder.rglob("*control_step*.nbi")):
-        notes.print("Compiling the step drivers, once on this machine: about a minute.")
+        notes.print("Compiling the step drivers, once on this machine: a few minutes.")
 
 
 def warn_of_missing(error: ModuleNotFoundError) -> None:

@@ -22,7 +22,7 @@ from tlf_env.engine.drivers import (
 )
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.tiles import advance
-from tlf_env.numerics.compiled import driver
+from tlf_env.numerics.compiled import compile_for, driver
 
 processor_time_us = types.ExternalFunction("clock", types.int64())  # of the C library; POSIX: µs
 PARTS_FORMATIONS = 1024
@@ -74,6 +74,13 @@ def timed_sensing(arrays: Arrays, settings: Settings, spent: np.ndarray) -> None
             settings,
         )
         spent[4] += processor_time_us() - start
+
+
+def compile_timed(plant: BatchPlant) -> bool:
+    """Compile the drivers of this module, or load them from the cache; whether any was not there."""
+    arrays, settings, spent = plant.arrays, plant._settings, np.zeros(len(STAGES))
+    step = compile_for(timed_step, arrays, settings, spent)
+    return compile_for(timed_sensing, arrays, settings, spent) or step
 
 
 def stage_times(plant: BatchPlant, steps: int) -> dict[str, float]:

@@ -18,6 +18,7 @@ from tlf_env.engine.excerpt import Excerpt, empty_excerpt
 from tlf_env.engine.formation import NO_POSES, reference_table, refusal
 from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import STARTED
+from tlf_env.numerics.compiled import compile_for
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.scenario import Scenario, load_scenario
@@ -196,6 +197,36 @@ class BatchPlant:
             why = refusal(arrays, self._variants, result, robot, lane)
             raise ValueError(f"formation {lane}: {why}")
         drivers.look(arrays, chosen, True, self._settings)
+
+    def compile_start(self) -> bool:
+        """Compile the drivers of a reset, or load them from the cache; nothing is reset.
+
+        Returns whether any was not in the cache.
+        """
+        arrays, settings = self.arrays, self._settings
+        mask = np.zeros(self.formations, dtype=np.bool_)
+        compiled = (
+            compile_for(drivers.start, arrays, self._variants, mask, self._poses, settings),
+            compile_for(drivers.look, arrays, mask, True, settings),
+            compile_for(drivers.excerpt_of, arrays, mask, self._nothing),
+        )
+        return any(compiled)
+
+    def compile_step(self) -> bool:
+        """Compile the drivers of a step, in contact, too, or load them from the cache; nothing is stepped.
+
+        Returns whether any was not in the cache.
+        """
+        arrays, settings = self.arrays, self._settings
+        left = drivers.lanes_to_step(0, 0)
+        compiled = (
+            compile_for(drivers.control_step, arrays, left, self._nothing, settings),
+            compile_for(drivers.actuate, arrays, 0, 0, settings),
+            compile_for(drivers.sense, arrays, 0, 0, settings),
+            compile_for(drivers.transmit, arrays, 0, settings),
+            compile_for(drivers.refer, arrays, 0, 0, 0, settings),
+        )
+        return any(compiled)
 
     def excerpt(self, robot: int) -> Excerpt:
         """Memory for the results of one robot in each formation, not yet written."""

@@ -153,7 +153,7 @@ def _warn_that_nothing_is_kept(folder: Path | None) -> None:
     where = f"in {folder}" if folder else "in the user's cache or a temporary folder"
     warnings.warn(
         f"compiled code could not be kept {where}, so that every new process compiles it again, in "
-        "about a minute; the variable TLF_ENV_CACHE names another folder",
+        "a few minutes; the variable TLF_ENV_CACHE names another folder",
         RuntimeWarning,
         stacklevel=2,
     )
@@ -253,9 +253,31 @@ def law(function: F) -> F:
     Laws and blocks do not count references to their array arguments: the caller holds the arrays, and a
     count is an atomic write that threads would wait for. So they make no arrays, only views.
     """
-    compiled: F = numba.njit(error_model="numpy", forceinline=True, nogil=True, _nrt=False)(
-        function
-    )
+    compiled: F = numba.njit(
+        error_model="numpy", forceinline=True, nogil=True, _nrt=False, no_cfunc_wrapper=True
+    )(function)
+    return compiled
+
+
+def _for_compiled_code(function: F, **options: bool) -> F:
+    """Compile a function without what Python needs to call it, which takes long for a tuple of arrays.
+
+    If Python calls it all the same, it is compiled once more, with that.
+    """
+    dispatcher: Any = numba.njit(
+        error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options
+    )(function)
+
+    @functools.cache
+    def for_python() -> Any:
+        return numba.njit(error_model="numpy", nogil=True, **options)(function)
+
+    if dispatcher is not function:  # as it is where Numba is switched off
+        dispatcher._insert = lambda *_: (
+            None
+        )  # so that every call from Python asks for another function
+        dispatcher._compile_for_args = lambda *_, **__: for_python()
+    compiled: F = dispatcher
     return compiled
 
 
@@ -264,8 +286,7 @@ def block(function: F) -> F:
 
     A call copies the whole tuple of arrays, so that a block is best a loop over robots or lanes.
     """
-    compiled: F = numba.njit(error_model="numpy", nogil=True, _nrt=False)(function)
-    return compiled
+    return _for_compiled_code(function, _nrt=False)
 
 
 def view(function: F) -> F:
@@ -276,17 +297,29 @@ def view(function: F) -> F:
 
 def allocating(function: F) -> F:
     """Compile a short function that makes an array and passes it to a block."""
-    compiled: F = numba.njit(error_model="numpy", forceinline=True, nogil=True)(function)
-    return compiled
+    return _for_compiled_code(function, forceinline=True)
 
 
 def driver(function: F) -> F:
     """Compile a function over arrays, and keep the result on disk."""
-    dispatcher: Any = numba.njit(error_model="numpy", nogil=True)(function)
+    dispatcher: Any = numba.njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function)
     if dispatcher is not function:  # as it is where Numba is switched off
         dispatcher._cache = _NothingKept() if cache_folder() is None else _Cache(function)
     compiled: F = dispatcher
     return compiled
+
+
+def compile_for(function: Callable[..., Any], *arguments: Any) -> bool:
+    """Compile a driver for the types of some arguments, or load it from the cache; it is not called.
+
+    Returns whether it was not in the cache.
+    """
+    dispatcher: Any = function
+    if not hasattr(dispatcher, "typeof_pyval"):  # Numba is switched off
+        return False
+    before = sum(dispatcher.stats.cache_misses.values())
+    dispatcher.compile(tuple(dispatcher.typeof_pyval(one) for one in arguments))
+    return bool(sum(dispatcher.stats.cache_misses.values()) > before)
 
 
 @intrinsic

@@ -1,0 +1,173 @@
+"""``tlf compile``: what it compiles is all that an episode needs, and it ends in one line, whatever happens."""
+
+from __future__ import annotations
+
+import copy
+import json
+import multiprocessing
+import os
+import subprocess
+import sys
+import time
+from multiprocessing.connection import Connection
+
+import numpy as np
+import pytest
+
+from baselines import cli, compile_command
+from tlf_env import BatchPlant
+from tlf_env.numerics.compiled import cache_folder
+
+
+def arrays_of(plant: BatchPlant) -> list[np.ndarray]:
+    return copy.deepcopy([one for one in plant.arrays if isinstance(one, np.ndarray)])
+
+
+def test_compiling_changes_no_formation():
+    plant = BatchPlant("infinity", 3, disturbance="combined-hard")
+    before = arrays_of(plant)
+    for half in compile_command.HALVES:
+        getattr(plant, f"compile_{half}")()
+    for one, other in zip(arrays_of(plant), before, strict=True):
+        assert np.array_equal(one, other, equal_nan=True)
+    with pytest.raises(RuntimeError, match="call reset"):
+        plant.step(np.zeros((3, 3, 2)))
+    plant.reset(seed=0)
+    plant.step(np.full((3, 3, 2), 0.5))
+    before = arrays_of(plant)
+    for half in compile_command.HALVES:
+        getattr(plant, f"compile_{half}")()
+    for one, other in zip(arrays_of(plant), before, strict=True):
+        assert np.array_equal(one, other, equal_nan=True)
+
+
+# Episodes through several doors; prints the drivers of them that had to be compiled.
+EPISODES = """
+import json
+import numpy as np
+import tlf_env
+from tlf_env.engine import drivers
+
+for fields in ({}, {"plant": "kinematic"}, {"robots": 2, "dtype": "float64"}, {"estimator": "ekf"}):
+    env = tlf_env.parallel_env("infinity", **fields)
+    env.reset(seed=0)
+    env.step({agent: env.action_space(agent).sample() for agent in env.agents})
+near = [[0.0, 0.0, 0.0], [150.0, 0.0, 0.0], [1000.0, 0.0, 0.0]]  # two robots that could touch
+env = tlf_env.parallel_env("infinity")
+env.reset(seed=0, options={"poses": near})
+env.step({agent: np.ones(2, dtype=np.float32) for agent in env.agents})
+plant = tlf_env.BatchPlant(["infinity", "infinity"], 40, mixture=True, threads=2, disturbance="ice")
+plant.reset(seed=0)
+plant.step(np.zeros((40, 3, 2)), plant.excerpt(1))
+plant.write_excerpt(plant.excerpt(1))
+stats = {name: one.stats for name, one in vars(drivers).items() if hasattr(one, "stats")}
+found = sorted(name for name, one in stats.items() if one.cache_hits)
+print(json.dumps([found, [name for name, one in stats.items() if one.cache_misses]]))
+"""
+
+
+@pytest.mark.skipif(cache_folder() is None, reason="no compiled code is kept on this machine")
+def test_after_it_an_episode_finds_everything_in_the_cache():
+    compile_command.in_two_processes()
+    assert not compile_command.in_two_processes()
+    done = subprocess.run(
+        [sys.executable, "-c", EPISODES], capture_output=True, text=True, check=True
+    )
+    found, compiled = json.loads(done.stdout)
+    assert compiled == []
+    assert found == [
+        "actuate",
+        "control_step",
+        "excerpt_of",
+        "look",
+        "refer",
+        "sense",
+        "start",
+        "transmit",
+    ]
+
+
+@pytest.mark.parametrize(
+    ("anything", "says"), [(True, "Compiled the step drivers in 0 s"), (False, "All step drivers")]
+)
+def test_it_says_what_it_did(anything, says, monkeypatch, capsys):
+    monkeypatch.setattr(compile_command, "in_two_processes", lambda: anything)
+    monkeypatch.setattr(sys, "argv", ["tlf", "compile"])
+    cli.main()
+    printed = capsys.readouterr().out
+    assert printed.startswith(says)
+    assert str(cache_folder()) in printed
+
+
+def leave(half: str, to_parent: Connection) -> None:
+    os._exit(7)
+
+
+def fail(half: str, to_parent: Connection) -> None:
+    to_parent.send(f"ValueError: {half}\nis wrong")
+
+
+def hang(half: str, to_parent: Connection) -> None:
+    time.sleep(600)
+
+
+def one_fails_one_hangs(half: str, to_parent: Connection) -> None:
+    (fail if half == compile_command.HALVES[1] else hang)(half, to_parent)
+
+
+@pytest.mark.parametrize(
+    ("child", "says"),
+    [
+        (leave, "a process ended with status 7"),
+        (fail, "is wrong"),
+        (one_fails_one_hangs, "ValueError: start is wrong"),
+    ],
+)
+def test_an_error_of_a_process_is_one_line(child, says, monkeypatch, capsys):
+    monkeypatch.setattr(compile_command, "compile_half", child)
+    monkeypatch.setattr(sys, "argv", ["tlf", "compile"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == cli.FAILED
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("tlf: the step drivers could not be compiled: ")
+    assert says in line
+    assert not multiprocessing.active_children()
+
+
+def test_an_error_while_compiling_is_sent(monkeypatch):
+    class Sent(list):
+        send = list.append
+
+    def wrong(half: str) -> bool:
+        raise MemoryError(half)
+
+    monkeypatch.setattr(compile_command.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(compile_command, "compiled", wrong)
+    sent = Sent()
+    compile_command.compile_half("step", sent)
+    assert sent == ["MemoryError: step"]
+
+
+def test_an_interrupt_ends_both(monkeypatch, capsys):
+    def interrupted(waiting: list[Connection]) -> None:
+        assert len(multiprocessing.active_children()) == len(waiting) == 2
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(compile_command, "compile_half", hang)
+    monkeypatch.setattr(compile_command, "wait", interrupted)
+    monkeypatch.setattr(sys, "argv", ["tlf", "compile"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == cli.INTERRUPTED
+    assert capsys.readouterr().err.splitlines() == ["tlf: interrupted"]
+    assert not multiprocessing.active_children()
+
+
+def test_without_a_folder_nothing_is_compiled(monkeypatch, capsys):
+    monkeypatch.setattr("tlf_env.numerics.compiled.cache_folder", lambda: None)
+    monkeypatch.setattr(sys, "argv", ["tlf", "compile"])
+    with pytest.raises(SystemExit) as ended:
+        cli.main()
+    assert ended.value.code == cli.FAILED
+    assert "TLF_ENV_CACHE" in capsys.readouterr().err
