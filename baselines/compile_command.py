@@ -64,7 +64,8 @@ def in_two_processes() -> bool:
             running[answers] = process
         anything = False
         while running:
-            for answers in wait(list(running)):
+            ready = wait(list(running))
+            for answers in [one for one in running if one in ready]:
                 process = running.pop(answers)
                 try:
                     answer = answers.recv()

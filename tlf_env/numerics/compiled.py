@@ -35,6 +35,7 @@ from numba.core.caching import (
 )
 from numba.core.cgutils import create_struct_proxy
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.registry import CPUDispatcher
 from numba.extending import intrinsic
 
 from tlf_env.common.errors import shown
@@ -244,6 +245,33 @@ class _Cache(FunctionCache):
             _warn_that_nothing_is_kept(cache_folder())
 
 
+class _Inner(CPUDispatcher):
+    """A function for compiled code. For Python it is compiled a second time, when Python first calls it.
+
+    What Python needs to call a function takes long to compile, most of all for tuples of arrays.
+    """
+
+    def _insert(self, *_: Any) -> None:
+        """Keep what was compiled from Python, which could not call it."""
+
+    def _compile_for_args(self, *_: Any, **__: Any) -> Any:
+        """What Python calls instead."""
+        if not hasattr(self, "_for_python"):
+            options = {**self.targetoptions, "no_cpython_wrapper": False}
+            self._for_python = CPUDispatcher(self.py_func, targetoptions=options)
+        return self._for_python
+
+
+def _inner(function: F, **options: bool) -> F:
+    """Compile a function that compiled code calls."""
+    if numba.config.DISABLE_JIT:
+        return function
+    common = {"nopython": True, "nogil": True, "error_model": "numpy"}
+    without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
+    dispatcher: F = _Inner(function, targetoptions={**common, **without, **options})
+    return dispatcher
+
+
 def law(function: F) -> F:
     """Compile a scalar law so that it is inlined into its callers.
 
@@ -253,32 +281,7 @@ def law(function: F) -> F:
     Laws and blocks do not count references to their array arguments: the caller holds the arrays, and a
     count is an atomic write that threads would wait for. So they make no arrays, only views.
     """
-    compiled: F = numba.njit(
-        error_model="numpy", forceinline=True, nogil=True, _nrt=False, no_cfunc_wrapper=True
-    )(function)
-    return compiled
-
-
-def _for_compiled_code(function: F, **options: bool) -> F:
-    """Compile a function without what Python needs to call it, which takes long for a tuple of arrays.
-
-    If Python calls it all the same, it is compiled once more, with that.
-    """
-    dispatcher: Any = numba.njit(
-        error_model="numpy", nogil=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, **options
-    )(function)
-
-    @functools.cache
-    def for_python() -> Any:
-        return numba.njit(error_model="numpy", nogil=True, **options)(function)
-
-    if dispatcher is not function:  # as it is where Numba is switched off
-        dispatcher._insert = lambda *_: (
-            None
-        )  # so that every call from Python asks for another function
-        dispatcher._compile_for_args = lambda *_, **__: for_python()
-    compiled: F = dispatcher
-    return compiled
+    return _inner(function, forceinline=True, _nrt=False)
 
 
 def block(function: F) -> F:
@@ -286,7 +289,7 @@ def block(function: F) -> F:
 
     A call copies the whole tuple of arrays, so that a block is best a loop over robots or lanes.
     """
-    return _for_compiled_code(function, _nrt=False)
+    return _inner(function, _nrt=False)
 
 
 def view(function: F) -> F:
@@ -297,7 +300,7 @@ def view(function: F) -> F:
 
 def allocating(function: F) -> F:
     """Compile a short function that makes an array and passes it to a block."""
-    return _for_compiled_code(function, forceinline=True)
+    return _inner(function, forceinline=True)
 
 
 def driver(function: F) -> F:
