@@ -22,12 +22,12 @@ run: compile ## Run the reference policy on the preset infinity; results in resu
 	$(BIN)/tlf run infinity --out results/infinity
 
 compile: $(VENV)/.stamp-run ## Compile the step drivers, if that was not done before
-	$(BIN)/tlf compile
+	$(BIN)/tlf compile $(COMPILE)
 
 # Compiled first, because every process of pytest would compile the same drivers otherwise.
 # In the order of their names: the files with the fewest tests, which would come last otherwise, take longest.
 test: $(VENV)/.stamp-test ## Run the checks, and compile meanwhile; then run the tests
-	$(MAKE) -j 2 check compile
+	$(MAKE) -j 2 check compile COMPILE=--all
 	$(BIN)/pytest -n $(JOBS) --dist loadfile --no-loadscope-reorder --durations=25 --durations-min=5
 
 test-slow: $(VENV)/.stamp-test ## Run the slow tests

@@ -650,11 +650,16 @@ def tune(
 
 
 @app.command("compile")
-def compile_() -> None:
+def compile_(
+    everything: Annotated[
+        bool,
+        typer.Option("--all", help="Also the drivers of scenarios in float64, and of tlf speed."),
+    ] = False,
+) -> None:
     """Compile the step drivers ahead of the first run, on two cores; nothing is done twice."""
-    from baselines.compile_command import compile_drivers
+    from baselines.compile_command import ALL, USUAL, compile_drivers
 
-    compile_drivers()
+    compile_drivers(ALL if everything else USUAL)
 
 
 def draw_bench(board: dict[str, Any], folder: Path) -> list[Path]:

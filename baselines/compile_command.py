@@ -9,13 +9,24 @@ import time
 from contextlib import suppress
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
+from typing import NamedTuple
 
 from baselines.console import notes, screen
 
-HALVES = ("step", "start")  # the longer one first
+
+class Share(NamedTuple):
+    """What one process compiles."""
+
+    dtype: str  # of the scenario: each has drivers of its own
+    of: tuple[str, ...]  # step, start, speed
 
 
-def compile_drivers() -> None:
+# Each for two processes: what most runs need, and everything.
+USUAL = (Share("float32", ("step",)), Share("float32", ("start",)))
+ALL = (Share("float32", ("step", "start", "speed")), Share("float64", ("step", "start")))
+
+
+def compile_drivers(shares: tuple[Share, ...] = USUAL) -> None:
     """Compile what is not in the cache yet, and print how long it took.
 
     Raises
@@ -32,7 +43,7 @@ def compile_drivers() -> None:
         )
     began = time.perf_counter()
     with notes.status("Compiling the step drivers"):
-        anything = in_two_processes()
+        anything = in_two_processes(shares)
     took_s = time.perf_counter() - began
     if anything:
         text = f"Compiled the step drivers in {took_s:.0f} s, into {folder}"
@@ -41,8 +52,8 @@ def compile_drivers() -> None:
     screen.print(text, soft_wrap=True)
 
 
-def in_two_processes() -> bool:
-    """Compile both halves at the same time; whether anything had to be compiled.
+def in_two_processes(shares: tuple[Share, ...]) -> bool:
+    """Compile both shares at the same time; whether anything had to be compiled.
 
     However this ends, no process is left behind.
 
@@ -55,9 +66,9 @@ def in_two_processes() -> bool:
     processes = []
     running = {}
     try:
-        for half in HALVES:
+        for share in shares:
             answers, to_parent = context.Pipe(duplex=False)
-            process = context.Process(target=compile_half, args=(half, to_parent), daemon=True)
+            process = context.Process(target=compile_share, args=(share, to_parent), daemon=True)
             process.start()
             to_parent.close()
             processes.append(process)
@@ -82,30 +93,33 @@ def in_two_processes() -> bool:
             process.join()
 
 
-def compile_half(half: str, to_parent: Connection) -> None:
-    """Compile one half, in a process of its own; send whether anything had to be compiled, or an error."""
+def compile_share(share: Share, to_parent: Connection) -> None:
+    """Compile one share, in a process of its own; send whether anything had to be compiled, or an error."""
     signal.signal(
         signal.SIGINT, signal.SIG_IGN
     )  # the parent is interrupted, too, and ends this process
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        answer: bool | str = compiled(half)
+        answer: bool | str = compiled(share)
     except Exception as error:
         answer = f"{type(error).__name__}: {error}"
     with suppress(BrokenPipeError):
         to_parent.send(answer)
 
 
-def compiled(half: str) -> bool:
-    """Compile one half in this process; whether anything had to be compiled."""
+def compiled(share: Share) -> bool:
+    """Compile one share in this process; whether anything had to be compiled."""
     from baselines.speed.parts import compile_timed
     from tlf_env.engine.batch import BatchPlant
 
-    plant = BatchPlant("infinity", 1)
-    if half == "start":
-        return plant.compile_start()
-    step = plant.compile_step()
-    return compile_timed(plant) or step  # they share most of their code with those of a step
+    plant = BatchPlant("infinity", 1, dtype=share.dtype)
+    how = {
+        "step": plant.compile_step,
+        "start": plant.compile_start,
+        "speed": lambda: compile_timed(plant),
+    }
+    answers = [how[what]() for what in share.of]  # all of them, whatever the first one says
+    return any(answers)
 
 
 def _end_with_parent() -> None:

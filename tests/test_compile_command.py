@@ -15,6 +15,7 @@ import numpy as np
 import pytest
 
 from baselines import cli, compile_command
+from baselines.compile_command import Share
 from tlf_env import BatchPlant
 from tlf_env.numerics.compiled import cache_folder
 
@@ -26,8 +27,8 @@ def arrays_of(plant: BatchPlant) -> list[np.ndarray]:
 def test_compiling_changes_no_formation():
     plant = BatchPlant("infinity", 3, disturbance="combined-hard")
     before = arrays_of(plant)
-    for half in compile_command.HALVES:
-        getattr(plant, f"compile_{half}")()
+    plant.compile_step()
+    plant.compile_start()
     for one, other in zip(arrays_of(plant), before, strict=True):
         assert np.array_equal(one, other, equal_nan=True)
     with pytest.raises(RuntimeError, match="call reset"):
@@ -35,8 +36,8 @@ def test_compiling_changes_no_formation():
     plant.reset(seed=0)
     plant.step(np.full((3, 3, 2), 0.5))
     before = arrays_of(plant)
-    for half in compile_command.HALVES:
-        getattr(plant, f"compile_{half}")()
+    plant.compile_step()
+    plant.compile_start()
     for one, other in zip(arrays_of(plant), before, strict=True):
         assert np.array_equal(one, other, equal_nan=True)
 
@@ -48,7 +49,7 @@ import numpy as np
 import tlf_env
 from tlf_env.engine import drivers
 
-for fields in ({}, {"plant": "kinematic"}, {"robots": 2, "dtype": "float64"}, {"estimator": "ekf"}):
+for fields in ({}, {"plant": "kinematic"}, {"robots": 2}, {"estimator": "ekf"}):
     env = tlf_env.parallel_env("infinity", **fields)
     env.reset(seed=0)
     env.step({agent: env.action_space(agent).sample() for agent in env.agents})
@@ -68,8 +69,8 @@ print(json.dumps([found, [name for name, one in stats.items() if one.cache_misse
 
 @pytest.mark.skipif(cache_folder() is None, reason="no compiled code is kept on this machine")
 def test_after_it_an_episode_finds_everything_in_the_cache():
-    compile_command.in_two_processes()
-    assert not compile_command.in_two_processes()
+    compile_command.in_two_processes(compile_command.USUAL)
+    assert not compile_command.in_two_processes(compile_command.USUAL)
     done = subprocess.run(
         [sys.executable, "-c", EPISODES], capture_output=True, text=True, check=True
     )
@@ -80,6 +81,7 @@ def test_after_it_an_episode_finds_everything_in_the_cache():
         "control_step",
         "excerpt_of",
         "look",
+        "mark",
         "refer",
         "sense",
         "start",
@@ -91,7 +93,7 @@ def test_after_it_an_episode_finds_everything_in_the_cache():
     ("anything", "says"), [(True, "Compiled the step drivers in 0 s"), (False, "All step drivers")]
 )
 def test_it_says_what_it_did(anything, says, monkeypatch, capsys):
-    monkeypatch.setattr(compile_command, "in_two_processes", lambda: anything)
+    monkeypatch.setattr(compile_command, "in_two_processes", lambda shares: anything)
     monkeypatch.setattr(sys, "argv", ["tlf", "compile"])
     cli.main()
     printed = capsys.readouterr().out
@@ -99,20 +101,20 @@ def test_it_says_what_it_did(anything, says, monkeypatch, capsys):
     assert str(cache_folder()) in printed
 
 
-def leave(half: str, to_parent: Connection) -> None:
+def leave(share: Share, to_parent: Connection) -> None:
     os._exit(7)
 
 
-def fail(half: str, to_parent: Connection) -> None:
-    to_parent.send(f"ValueError: {half}\nis wrong")
+def fail(share: Share, to_parent: Connection) -> None:
+    to_parent.send(f"ValueError: {share.of[0]}\nis wrong")
 
 
-def hang(half: str, to_parent: Connection) -> None:
+def hang(share: Share, to_parent: Connection) -> None:
     time.sleep(600)
 
 
-def one_fails_one_hangs(half: str, to_parent: Connection) -> None:
-    (fail if half == compile_command.HALVES[1] else hang)(half, to_parent)
+def one_fails_one_hangs(share: Share, to_parent: Connection) -> None:
+    (fail if share == compile_command.USUAL[1] else hang)(share, to_parent)
 
 
 @pytest.mark.parametrize(
@@ -124,7 +126,7 @@ def one_fails_one_hangs(half: str, to_parent: Connection) -> None:
     ],
 )
 def test_an_error_of_a_process_is_one_line(child, says, monkeypatch, capsys):
-    monkeypatch.setattr(compile_command, "compile_half", child)
+    monkeypatch.setattr(compile_command, "compile_share", child)
     monkeypatch.setattr(sys, "argv", ["tlf", "compile"])
     with pytest.raises(SystemExit) as ended:
         cli.main()
@@ -139,14 +141,14 @@ def test_an_error_while_compiling_is_sent(monkeypatch):
     class Sent(list):
         send = list.append
 
-    def wrong(half: str) -> bool:
-        raise MemoryError(half)
+    def wrong(share: Share) -> bool:
+        raise MemoryError(share.dtype)
 
     monkeypatch.setattr(compile_command.signal, "signal", lambda *_: None)
     monkeypatch.setattr(compile_command, "compiled", wrong)
     sent = Sent()
-    compile_command.compile_half("step", sent)
-    assert sent == ["MemoryError: step"]
+    compile_command.compile_share(compile_command.USUAL[0], sent)
+    assert sent == ["MemoryError: float32"]
 
 
 def test_an_interrupt_ends_both(monkeypatch, capsys):
@@ -154,7 +156,7 @@ def test_an_interrupt_ends_both(monkeypatch, capsys):
         assert len(multiprocessing.active_children()) == len(waiting) == 2
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(compile_command, "compile_half", hang)
+    monkeypatch.setattr(compile_command, "compile_share", hang)
     monkeypatch.setattr(compile_command, "wait", interrupted)
     monkeypatch.setattr(sys, "argv", ["tlf", "compile"])
     with pytest.raises(SystemExit) as ended:

@@ -225,6 +225,7 @@ class BatchPlant:
             compile_for(drivers.sense, arrays, 0, 0, settings),
             compile_for(drivers.transmit, arrays, 0, settings),
             compile_for(drivers.refer, arrays, 0, 0, 0, settings),
+            compile_for(drivers.mark, arrays, 0, 0, 0),
         )
         return any(compiled)
 
