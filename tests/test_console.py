@@ -56,7 +56,9 @@ def test_an_error_is_one_line_and_status_2_in_every_encoding(encoding, words):
     assert lines[0].startswith("tlf: ")
 
 
-@pytest.mark.parametrize("command", ["run", "openloop", "speed", "bench", "train", "tune", "compile"])
+@pytest.mark.parametrize(
+    "command", ["run", "openloop", "speed", "bench", "train", "tune", "compile"]
+)
 def test_every_help_is_printed_in_ascii(command):
     done = tlf([command, "--help"], "ascii")
     assert done.returncode == 0, done.stderr
