@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import copy
 import errno
 import functools
 import importlib.util
 import os
+import pickle
 import shutil
 import stat
 import subprocess
@@ -14,7 +16,7 @@ import warnings
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 import numpy as np
@@ -363,11 +365,66 @@ def test_a_read_only_folder_is_read_by_a_process_that_cannot_write_it(tmp_path):
         path.chmod(0o755)
 
 
+# --- functions for compiled code -----------------------------------------------------------------------
+
+
+class Pair(NamedTuple):
+    first: float
+    second: float
+
+
+@compiled.law
+def swapped(pair: Pair, by: float) -> Pair:
+    return Pair(pair.second / by, pair.first)
+
+
+@compiled.block
+def doubled(a: np.ndarray) -> None:
+    for i in range(a.shape[0]):
+        a[i] *= 2.0
+
+
+def test_python_can_call_what_is_compiled_for_compiled_code(cache):
+    """Before compiled code has called it and after, as a copy, and for other types."""
+
+    def both(a: np.ndarray) -> float:
+        doubled(a)
+        return swapped(Pair(1.0, a[0]), 0.0).first
+
+    for dtype in (np.float64, np.float32):
+        for _ in range(2):
+            assert swapped(Pair(1.0, 3.0), by=2.0) == (1.5, 1.0)
+            assert swapped(Pair(1.0, 3.0), dtype(0.0)) == (np.inf, 1.0)
+            a = np.ones(2, dtype=dtype)
+            doubled(a)
+            assert a.tolist() == [2.0, 2.0]
+            assert compiled.driver(both)(a) == np.inf
+            assert a.tolist() == [4.0, 4.0]
+    for other in (copy.deepcopy(swapped), pickle.loads(pickle.dumps(swapped))):
+        assert other(Pair(1.0, 3.0), 2.0) == (1.5, 1.0)
+    with pytest.raises(numba.TypingError):
+        swapped("text", 1.0)
+
+
+def test_a_driver_is_compiled_without_being_called(cache):
+    def driven(a: np.ndarray) -> None:
+        doubled(a)
+
+    a = np.ones(2)
+    driver = compiled.driver(driven)
+    assert compiled.compile_for(driver, a)
+    assert not compiled.compile_for(driver, a)
+    assert not compiled.compile_for(compiled.driver(driven), a)
+    assert a.tolist() == [1.0, 1.0]
+    assert not compiled.compile_for(driven, a)
+
+
 def test_nothing_is_cached_where_numba_is_switched_off(monkeypatch):
     monkeypatch.setattr(numba.config, "DISABLE_JIT", 1)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         assert compiled.driver(abs_of)(-2.0) == 2.0
+        assert compiled.law(abs_of) is abs_of
 
 
 def abs_of(value: float) -> float:
