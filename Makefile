@@ -5,6 +5,7 @@ TORCH ?= 2.13.0
 TESTS ?= tests
 JOBS ?= auto
 CLIENTS ?= $(basename $(notdir $(wildcard tests/clients/*.txt)))
+COMPILE :=
 
 VENV := .venv
 BIN := $(VENV)/bin
