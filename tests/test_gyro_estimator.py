@@ -9,15 +9,20 @@ import numpy as np
 import pytest
 
 from baselines import ReferencePolicy
+from baselines.policies.registry import fit_policy
+from baselines.runs.outcome import failed
+from baselines.runs.run import run_seeds
 from tlf_env import load_scenario, parallel_env
 from tlf_env.onboard.estimator import Estimate
 from tlf_env.onboard.gyro_estimator import (
+    ACCELERATION_TIME_S,
     GyroEkfParameters,
     GyroEstimate,
     correct_with_gyro,
     drag_mm_s2,
     gyro_ekf_constants,
     predict_with_gyro,
+    quietness,
     reported_slip,
 )
 from tlf_env.physics.vehicle import RobotParameters, body
@@ -39,8 +44,9 @@ def advanced(
     fixes: Any = None,
     **parameters: Any,
 ) -> tuple[Estimate, GyroEstimate, tuple[float, float]]:
-    """Pose, errors and reported slip after some samples, without fixes or with ``fixes(t_s)``."""
-    ekf = gyro_ekf_constants(GyroEkfParameters(**parameters), BODY, DT_S)
+    """Pose, errors and slip after some samples, without fixes or with ``fixes(t_s)``; all slip is reported."""
+    given = {"floor_slip_acceleration_mm_s2": None} | parameters
+    ekf = gyro_ekf_constants(GyroEkfParameters(**given), BODY, DT_S)
     estimate, found = START, REST
     for k in range(samples):
         estimate, found = predict_with_gyro(estimate, found, ekf, u_1, rate, torque, DT_S)
@@ -250,9 +256,14 @@ def test_the_payload_is_not_known_to_the_filter():
 
 
 def slip_errors(estimator: str, disturbance: Any) -> np.ndarray:
-    """RMS of the errors of δ₁ (mm/s) and δ₂ (rad/s), worst robot, from 5 to 12 s."""
+    """RMS of the errors of δ₁ (mm/s) and δ₂ (rad/s), worst robot, from 5 to 12 s; all slip is reported."""
     env = parallel_env(
-        "infinity", estimator=estimator, disturbance=disturbance, horizon_s=12.0, end_on=()
+        "infinity",
+        estimator=estimator,
+        disturbance=disturbance,
+        horizon_s=12.0,
+        end_on=(),
+        ekf_gyro={"floor_slip_acceleration_mm_s2": None},
     )
     policy, rows = ReferencePolicy("tuned"), []
     seen, _ = env.reset(seed=3)
@@ -288,3 +299,71 @@ def test_a_kinematic_plant_has_no_torques_so_the_encoders_give_the_speed():
 def test_impossible_parameters_are_named(field, value):
     with pytest.raises(ValueError, match=rf"ekf_gyro\.{field}"):
         load_scenario("infinity", ekf_gyro={field: value})
+
+
+FULL_SPEED_MM_S, SLIP_MM_S = 300.0, 30.0
+
+
+def reported_over(samples: int, slip_mm_s: float, acceleration_mm_s2: float) -> list[float]:
+    """Reported δ₁ while the torques accelerate the body, for wheels that turn with another speed."""
+    ekf = gyro_ekf_constants(GyroEkfParameters(fix_variance_time_s=None), BODY, DT_S)
+    by_drag = drag_mm_s2(BODY) + acceleration_mm_s2
+    torque = by_drag * ROBOT.mass_kg * ROBOT.wheel_radius_mm
+    rolled = (FULL_SPEED_MM_S - slip_mm_s) * DT_S
+    estimate, found, seen = START, REST._replace(rolled=rolled, advance=FULL_SPEED_MM_S * DT_S), []
+    found = found._replace(speed=FULL_SPEED_MM_S)
+    for _ in range(samples):
+        estimate, found = predict_with_gyro(estimate, found, ekf, rolled, 0.0, torque, DT_S)
+        found = found._replace(speed_error=0.0)
+        estimate, found, *_ = correct_with_gyro(estimate, found, ekf, 0.0, 0.0, 0.0, 0.0, 0.0, DT_S)
+        seen.append(reported_slip(found, ekf)[0])
+    return seen
+
+
+def test_slip_at_constant_speed_is_the_floors():
+    assert reported_over(600, SLIP_MM_S, 0.0)[-1] > 0.3 * SLIP_MM_S
+
+
+def test_slip_of_tyres_that_transmit_force_is_not_reported():
+    """The same slip, while the torques accelerate the body by more than the limit."""
+    assert not any(reported_over(600, SLIP_MM_S, 200.0))
+
+
+def test_a_slip_below_the_least_is_not_reported():
+    assert not any(reported_over(2000, 0.9 * GyroEkfParameters().floor_slip_mm_s, 0.0))
+
+
+def test_how_quiet_a_body_is_depends_on_all_its_acceleration():
+    parameters = GyroEkfParameters()
+    most = parameters.floor_slip_acceleration_mm_s2
+    ekf = gyro_ekf_constants(parameters, BODY, DT_S)
+    arm_mm = ROBOT.body_inertia_kg_mm2 / ROBOT.mass_kg / (ROBOT.axle_width_mm / 2)
+    assert ekf.arm == pytest.approx(arm_mm, rel=0.05)
+    for share, quiet in ((0.0, 1.0), (0.5, 1.0), (0.75, 0.5), (1.0, 0.0), (3.0, 0.0)):
+        a = share * most
+        forward = REST._replace(speed=200.0 - a * ACCELERATION_TIME_S)
+        turning = REST._replace(yaw_rate=-a / ekf.arm * ACCELERATION_TIME_S)
+        assert quietness(forward, ekf, 200.0, 0.0) == pytest.approx(quiet, abs=1e-12)
+        assert quietness(turning, ekf, 0.0, 0.0) == pytest.approx(quiet, abs=1e-12)
+        curve = REST._replace(speed=200.0, yaw_rate=a / 200.0)
+        assert quietness(curve, ekf, 200.0, a / 200.0) == pytest.approx(quiet, abs=1e-12)
+        both = REST._replace(speed=200.0 - 0.6 * a * ACCELERATION_TIME_S, yaw_rate=0.8 * a / 200.0)
+        assert quietness(both, ekf, 200.0, 0.8 * a / 200.0) == pytest.approx(quiet, abs=1e-12)
+
+
+@pytest.mark.parametrize("friction_scale", [0.4, 0.35])
+def test_the_default_holds_a_floor_with_little_grip(friction_scale):
+    """A sliding tyre's slip is not subtracted; with all slip reported, runs of these seeds are lost."""
+    scenario = load_scenario(
+        "infinity",
+        disturbance={"tyre": {"friction_scale": friction_scale}},
+        start_ramp_s=6.0,
+        horizon_s=40.0,
+        plant="batch",
+    )
+    seeds = list(range(10_000, 10_008))
+    fitted = fit_policy("reference:linearised", scenario)
+    runs = [record.metrics() for record in run_seeds(fitted.scenario, fitted.policy, seeds)]
+    assert not any(map(failed, runs))
+    worst_mm = [max(robot.position_rmse_mm for robot in run) for run in runs]
+    assert np.median(worst_mm) < 1.0

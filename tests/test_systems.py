@@ -110,7 +110,7 @@ def test_a_path_with_a_plus_is_still_one_controller(tmp_path):
         ("kanayama+ekf+bodi", "limiter 'bodi' is not one of body, .*, FILE.yaml; did you mean"),
         (
             "kanayama+ekf+",
-            "limiter '' is not one of body, none, slippery, supervised, yaw-rate, FILE",
+            "limiter '' is not one of body, grip, none, supervised, yaw-rate, FILE",
         ),
         ("kanayama+ekf+body+none", r"limiter 'body\+none' is not one of"),
         ("kanayama+ekf+no_such.yaml", "cannot read no_such.yaml"),
@@ -174,7 +174,7 @@ def test_the_tuned_reference_is_the_sum_of_its_parts(tmp_path):
 
 def test_the_linearised_reference_is_a_system_of_a_textbooks_law():
     """One compiled law, in a controller and behind a limiter: the same bits."""
-    name = "feedback_linearisation:bounded+ekf-gyro-smoothed+body"
+    name = "feedback_linearisation:bounded+ekf-gyro-smoothed+grip"
     alone, system = (fit_policy(one, SCENARIO) for one in ("reference:linearised", name))
     assert (alone.overrides, system.overrides) == ({}, {"broadcast_smoothing_s": 0.1})
     assert alone.scenario.smoothing_s == 0.1

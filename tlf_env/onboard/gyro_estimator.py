@@ -14,10 +14,15 @@ both random walks, and the error of the gyro's scale, a constant. δ₁ and δ�
 and yaw rate minus the encoders'. The variance of the fixes is adapted as in the slip filter. The weight of a
 fix whose normalised innovation is large is reduced, so that outliers count little (bounded influence:
 Huber, Robust Estimation of a Location Parameter, Annals of Mathematical Statistics, 1964).
+
+A tyre that transmits force slips, too. A controller that subtracts this slip turns the wheel faster, and on a
+floor with little grip the wheel then spins. So slip is reported only after slip was seen while the body hardly
+accelerated, when the tyres transmit little: then it is the floor's.
 """
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 from tlf_env.common.models import Frozen, NonNegative, Positive, infinite_if_none
@@ -35,6 +40,7 @@ from tlf_env.onboard.slip_estimator import sample_weight
 from tlf_env.physics.vehicle import Body
 
 LEAST_KNOWN_MM2 = 1e-9  # of the adapted variance
+ACCELERATION_TIME_S = 0.08  # averaging time of the body's acceleration
 CRAWL_MM_S = 5.0  # below, the wheels may be held by their joints: the torques say little
 
 
@@ -60,6 +66,14 @@ class GyroEkfParameters(Frozen):
     slip_time_s: Positive = 0.02  # averaging time of δ₁ and δ₂, against the encoders' noise
     delta_1_bound_mm_s: NonNegative = 60.0
     delta_2_bound_rad_s: NonNegative = 0.415
+    # Slip is reported as the floor's where its average over samples with little acceleration is above
+    # floor_slip_mm_s or floor_slip_rad_s, and in full from twice that on. A sample counts fully below half of
+    # this acceleration, and not at all above it. None: all slip is reported.
+    floor_slip_acceleration_mm_s2: Positive | None = 100.0
+    floor_slip_mm_s: Positive = 10.0
+    floor_slip_rad_s: Positive = 0.08
+    floor_slip_rise_s: Positive = 0.3  # averaging time of slip that grows
+    floor_slip_decay_s: Positive = 20.0  # of slip that shrinks
 
 
 class GyroEkf(NamedTuple):
@@ -87,6 +101,14 @@ class GyroEkf(NamedTuple):
     drag: float  # change of the motion in a sample by the joints' friction, mm
     crawl: float  # mm per sample
     to_encoders: float  # share by which the motion returns to that of the encoders
+    motion_weight: float  # weight of a sample in the smoothed twist
+    arm: float  # mm: force at a wheel by yaw acceleration, as an acceleration of the body
+    most_quiet: float  # mm/s²: above, the slip of a sample does not count as the floor's
+    rise: float  # weights of a sample in the average slip of the floor
+    decay: float
+    floor_1: float  # mm/s and rad/s: above, the average counts as slip of the floor
+    floor_2: float
+    all_slip: float  # 1 if all slip is reported, else 0
 
 
 class GyroEstimate(NamedTuple):
@@ -117,6 +139,10 @@ class GyroEstimate(NamedTuple):
     slip_2: float
     rolled: float  # last increment of the encoders, mm
     advance: float  # last increment from the torques, mm
+    speed: float  # smoothed twist of the body, mm/s and rad/s
+    yaw_rate: float
+    floor_1: float  # average of |δ₁| and |δ₂| while the body hardly accelerates, mm/s and rad/s
+    floor_2: float
 
 
 def gyro_ekf_constants(parameters: GyroEkfParameters, robot: Body, dt_s: float) -> GyroEkf:
@@ -149,6 +175,14 @@ def gyro_ekf_constants(parameters: GyroEkfParameters, robot: Body, dt_s: float) 
         to_encoders=1.0
         if parameters.torque_time_s is None
         else sample_weight(dt_s, parameters.torque_time_s),
+        motion_weight=sample_weight(dt_s, ACCELERATION_TIME_S),
+        arm=robot.I * robot.inverse_m / robot.h,
+        most_quiet=infinite_if_none(parameters.floor_slip_acceleration_mm_s2),
+        rise=sample_weight(dt_s, parameters.floor_slip_rise_s),
+        decay=sample_weight(dt_s, parameters.floor_slip_decay_s),
+        floor_1=parameters.floor_slip_mm_s,
+        floor_2=parameters.floor_slip_rad_s,
+        all_slip=0.0 if parameters.floor_slip_acceleration_mm_s2 is not None else 1.0,
     )
 
 
@@ -278,8 +312,25 @@ corrected_errors = replacing(
     *("speed_error", "gyro_error", "scale_error"),
     *("p_x1", "p_y1", "p_t1", "p_x2", "p_y2", "p_t2", "p_x3", "p_y3", "p_t3"),
     *("p_11", "p_12", "p_13", "p_22", "p_23", "p_33"),
-    *("variance", "d_x", "d_y", "slip_1", "slip_2"),
+    *("variance", "d_x", "d_y", "slip_1", "slip_2", "speed", "yaw_rate", "floor_1", "floor_2"),
 )
+
+
+@law
+def quietness(found: GyroEstimate, ekf: GyroEkf, speed: float, yaw_rate: float) -> float:
+    """How little force the tyres transmit, 0 to 1, from the acceleration of the body per tyre."""
+    forward = abs(speed - found.speed) + ekf.arm * abs(yaw_rate - found.yaw_rate)
+    forward = forward / ACCELERATION_TIME_S
+    sideways = speed * yaw_rate
+    share = math.sqrt(forward * forward + sideways * sideways) / ekf.most_quiet
+    return min(max(2.0 - 2.0 * share, 0.0), 1.0)
+
+
+@law
+def averaged_floor(average: float, slip: float, quiet: float, ekf: GyroEkf) -> float:
+    """The average of |slip| after a sample; it follows growing slip faster."""
+    more = abs(slip) - average
+    return average + quiet * (ekf.rise * max(more, 0.0) + ekf.decay * min(more, 0.0))
 
 
 @law
@@ -320,8 +371,11 @@ def correct_with_gyro(
     speed_error = min(max(speed_error, -ekf.bound_1), ekf.bound_1)
     gyro_error = min(max(gyro_error, -ekf.bound_2), ekf.bound_2)
     scale_error = min(max(scale_error, -ekf.bound_3), ekf.bound_3)
-    new_1 = (found.advance - found.rolled) / dt + speed_error
-    new_2 = rate + gyro_error + scale_error * rate - u_2 / dt
+    speed = found.advance / dt + speed_error
+    yaw_rate = rate + gyro_error + scale_error * rate
+    slip_1 = found.slip_1 + ekf.slip_weight * (speed - found.rolled / dt - found.slip_1)
+    slip_2 = found.slip_2 + ekf.slip_weight * (yaw_rate - u_2 / dt - found.slip_2)
+    quiet = quietness(found, ekf, speed, yaw_rate)
     # Differences of successive innovations have twice the variance of a fix; slow errors cancel.
     step_x, step_y = d_x - found.d_x, d_y - found.d_y
     last_x, last_y = (d_x, d_y) if here > 0.0 else (found.d_x, found.d_y)
@@ -351,8 +405,12 @@ def correct_with_gyro(
             variance=found.variance + here * ekf.variance_weight * (square - known),
             d_x=last_x,
             d_y=last_y,
-            slip_1=found.slip_1 + ekf.slip_weight * (new_1 - found.slip_1),
-            slip_2=found.slip_2 + ekf.slip_weight * (new_2 - found.slip_2),
+            slip_1=slip_1,
+            slip_2=slip_2,
+            speed=found.speed + ekf.motion_weight * (speed - found.speed),
+            yaw_rate=found.yaw_rate + ekf.motion_weight * (yaw_rate - found.yaw_rate),
+            floor_1=averaged_floor(found.floor_1, slip_1, quiet, ekf),
+            floor_2=averaged_floor(found.floor_2, slip_2, quiet, ekf),
         ),
         d_x,
         d_y,
@@ -362,8 +420,10 @@ def correct_with_gyro(
 
 @law
 def reported_slip(found: GyroEstimate, ekf: GyroEkf) -> tuple[float, float]:
-    """δ₁ (mm/s) and δ₂ (rad/s) within their bounds."""
+    """δ₁ (mm/s) and δ₂ (rad/s) of the floor, within their bounds; 0 while none was seen."""
+    seen = max(found.floor_1 / ekf.floor_1, found.floor_2 / ekf.floor_2) - 1.0
+    share = min(max(seen, ekf.all_slip, 0.0), 1.0)
     return (
-        min(max(found.slip_1, -ekf.reported_1), ekf.reported_1),
-        min(max(found.slip_2, -ekf.reported_2), ekf.reported_2),
+        share * min(max(found.slip_1, -ekf.reported_1), ekf.reported_1),
+        share * min(max(found.slip_2, -ekf.reported_2), ekf.reported_2),
     )

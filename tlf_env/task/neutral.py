@@ -183,6 +183,11 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "slip_time_s": 0.02,
         "delta_1_bound_mm_s": 60.0,
         "delta_2_bound_rad_s": 0.415,
+        "floor_slip_acceleration_mm_s2": 100.0,
+        "floor_slip_mm_s": 10.0,
+        "floor_slip_rad_s": 0.08,
+        "floor_slip_rise_s": 0.3,
+        "floor_slip_decay_s": 20.0,
     },
     "SlipEkfParameters": {
         "forward_noise_mm2_s": 35.0,
