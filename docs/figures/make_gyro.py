@@ -20,6 +20,8 @@ from baselines.runs.seed_ranges import FIRST_TABLE_SEED
 from tlf_env.common.presets import read_preset_or_file
 
 LAW = "feedback_linearisation:bounded"
+LIMITER = "grip"  # of the table of slip
+ALL_SLIP = {"ekf_gyro": {"floor_slip_acceleration_mm_s2": None}}
 # A gyro as sold, in every column: noise, walking bias and a scale within 3 %.
 GYRO = read_preset_or_file("disturbance", "gyro")["gyro"]
 BY_ENCODERS = {"ekf_gyro": {"torque_time_s": None}}
@@ -85,8 +87,9 @@ def slippery(friction_scale: float) -> list[dict[str, float]]:
 # Sensors, motors, robots and floors, on systems of these estimators and limiters.
 OTHERS = {
     "`ekf-slip`": "ekf-slip+body",
+    "all slip reported": "ekf-gyro-smoothed+body",
     "`ekf-gyro-smoothed`": "ekf-gyro-smoothed+body",
-    "`ekf-gyro-smoothed+slippery`": "ekf-gyro-smoothed+slippery",
+    "`ekf-gyro-smoothed+grip`": "ekf-gyro-smoothed+grip",
     "`truth`": "truth+body",
 }
 SLOW_START = {"start_ramp_s": 6.0}
@@ -105,6 +108,10 @@ CONDITIONS: dict[str, dict[str, Any]] = {
     "friction × 0.35": {"disturbance": {"tyre": {"friction_scale": 0.35}}, **SLOW_START},
     "`patches` (× 0.4), start within 6 s": {"disturbance": "patches", **SLOW_START},
     "patches × 0.3": {"disturbance": {"tyre": {"patches": slippery(0.3)}}, **SLOW_START},
+    "`split-ice`": {"disturbance": "split-ice"},
+    "`payload`": {"disturbance": "payload"},
+    "`calibration`": {"disturbance": "calibration"},
+    "`fixes-outage`": {"disturbance": "fixes-outage"},
     "`slip`": {"disturbance": "slip"},
 }
 
@@ -113,12 +120,13 @@ def one(row: str, column: str, seeds: range) -> str:
     """A cell of the table of slip."""
     estimator, fields = ROWS[row]
     disturbance = {"slip": COLUMNS[column], "gyro": GYRO}
-    return cell((f"{LAW}+{estimator}+body", {}), {"disturbance": disturbance, **fields}, seeds)
+    return cell((f"{LAW}+{estimator}+{LIMITER}", {}), {"disturbance": disturbance, **fields}, seeds)
 
 
 def other(system: str, condition: str, seeds: range) -> str:
     """A cell of the table of other conditions."""
-    return cell((f"{LAW}+{OTHERS[system]}", {}), CONDITIONS[condition], seeds)
+    fields = ALL_SLIP if system == "all slip reported" else {}
+    return cell((f"{LAW}+{OTHERS[system]}", {}), {**CONDITIONS[condition], **fields}, seeds)
 
 
 def table(

@@ -33,7 +33,7 @@ SYSTEMS = (
     "reference:consistent",
     "reference:tuned",
     "feedback_linearisation:bounded+ekf-slip+body",
-    "feedback_linearisation:bounded+ekf-gyro-smoothed+body",
+    "feedback_linearisation:bounded+ekf-gyro-smoothed+grip",
     "reference:tuned+truth+body",
     "feedback_linearisation:bounded+truth+body",
 )
