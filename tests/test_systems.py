@@ -300,7 +300,7 @@ def test_a_batch_is_its_rows():
     np.testing.assert_array_equal(batch, [policy.predict(one)[0] for one in rows()])
 
 
-@pytest.mark.parametrize("limiter", ["", "+body"])
+@pytest.mark.parametrize("limiter", ["", "+grip"])
 def test_the_reference_without_gains_is_the_default_controller(limiter):
     default = make_policy(f"reference+ekf-gyro{limiter}", SCENARIO).predict(rows())[0]
     assert default.tobytes() == ReferencePolicy().predict(rows())[0].tobytes()
