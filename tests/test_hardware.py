@@ -245,11 +245,11 @@ def test_hardware_is_its_parts_together():
 
 
 def driven(**overrides):
-    """States (step, robot, entry) and sensor samples of two seconds under the reference policy."""
+    """States (step, robot, entry) and sensor samples of five seconds under the reference policy."""
     env = tlf_env.parallel_env("infinity", end_on=(), **overrides)
     seen, _ = env.reset(seed=3)
     policy, states, sensed = ReferencePolicy(), [], []
-    for _ in range(100):
+    for _ in range(250):
         seen = env.step({agent: policy.predict(row)[0] for agent, row in seen.items()})[0]
         states.append(env.formation.state().copy())
         sensed.append(env.formation.arrays.samples.copy())
