@@ -26,7 +26,16 @@ from tlf_env.task.scenario import load_scenario
 ROOT = Path(__file__).resolve().parents[2]
 DOCS = ROOT / "docs"
 README_TASKS = ("infinity", "flower")
-README_DISTURBANCES = ("nominal", "slip", "slip-noise", "ice", "start", "combined-hard", "swell")
+README_DISTURBANCES = (
+    "nominal",
+    "noise",
+    "slip",
+    "slip-noise",
+    "ice",
+    "start",
+    "combined-hard",
+    "swell",
+)
 TASK_NAMES = {"infinity": "∞", "flower": "Flower"}
 BOARDS = {"board": "leaderboard", "controllers": "leaderboard-controllers"}  # plan: page
 BEGIN, END = "<!-- board -->", "<!-- end of board -->"
