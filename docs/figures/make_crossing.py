@@ -1,9 +1,10 @@
 """Write the tables of ``docs/crossing.md``: controllers, estimators and limiters crossed.
 
-First run ``tlf bench --plan crossing --no-figures --out results/crossing``, and the same with
-``crossing-slow``. Then ``python docs/figures/make_crossing.py results/crossing results/crossing-slow`` keeps
-the cells in ``docs/crossing/cells.json``, and one run of each controller, which a test runs again, in
-``docs/crossing/slice.jsonl``. The same results give the same files. This needs the extra ``bench``.
+First run ``tlf bench --plan crossing --no-figures --out results/crossing``. Then
+``python docs/figures/make_crossing.py results/crossing`` keeps the cells in ``docs/crossing/cells.json``, and
+one run of each controller, which a test runs again, in ``docs/crossing/slice.jsonl``. Results of the plan
+``crossing-slow`` may follow as a second folder. The same results give the same files. This needs the extra
+``bench``.
 """
 
 from __future__ import annotations

@@ -1,10 +1,8 @@
-"""Controllers, estimators and limiters crossed: the tables of ``docs/systems.md``.
+"""The table of the rivals in ``docs/systems.md``: other laws, on seeds for choosing.
 
-``python docs/figures/make_systems.py`` drives 8 seeds of each cell for 60 s on the batch plant; it takes about
-a quarter of an hour on one core and needs no extra. ``--seeds N`` drives more, ``--only ESTIMATOR`` one table.
-``--rivals`` makes the table of
-the rivals instead, on seeds for choosing and with the processor time of each law; ``--rivals LAW`` only its
-rows.
+``python docs/figures/make_systems.py`` drives 8 seeds of each cell for 60 s on the batch plant and measures the
+processor time of each law; it takes about a quarter of an hour on one core and needs the extra ``mpc``.
+``--seeds N`` drives more, ``--only LAW ...`` only some rows.
 """
 
 from __future__ import annotations
@@ -23,42 +21,14 @@ from baselines.policies.laws.catalogue import LAWS
 from baselines.policies.registry import fit_policy
 from baselines.policies.systems import SystemName
 from baselines.runs.run import run_policy
-from baselines.runs.seed_ranges import CHOOSING_SEEDS, FIRST_TABLE_SEED
+from baselines.runs.seed_ranges import CHOOSING_SEEDS
 from tlf_env.task.scenario import load_scenario
 
-CONTROLLERS = (
-    "reference:printed",
-    "reference:consistent",
-    "reference:tuned",
-    "pure_pursuit",
-    "feedback_linearisation",
-    "feedback_linearisation:bounded",
-    "kanayama",
-    "kanayama:bounded",
-)
-LIMITERS = ("none", "yaw-rate", "body")
 RIVALS = tuple(f"{law}:bounded" for law in LAWS)
 RIVAL_LIMITERS = ("none", "body")
 RIVAL_ESTIMATORS = ("ekf-slip", "truth")
 RIVAL_DISTURBANCES = ("nominal", "slip")
 RIVAL_HEAD = "| controller | limiter |"
-ESTIMATORS = ("ekf", "ekf-slip", "ekf-gyro-smoothed", "truth")
-DISTURBANCES = ("nominal", "slip", "slip-ramps", "ice")
-
-
-def crossed(estimator: str, seeds: range) -> str:
-    """A row for each controller and limiter on one estimator, a column for each disturbance."""
-    lines = [
-        "| controller | limiter | " + " | ".join(f"`{one}`" for one in DISTURBANCES) + " |",
-        "|---|---" + "|---:" * len(DISTURBANCES) + "|",
-    ]
-    for controller in CONTROLLERS:
-        for limiter in LIMITERS:
-            name = str(SystemName(controller, estimator, limiter))
-            row = cells(name, DISTURBANCES, seeds)
-            lines.append(f"| `{controller}` | `{limiter}` | " + " | ".join(row) + " |")
-            print(lines[-1], flush=True)
-    return "\n".join(lines)
 
 
 def cells(name: str, disturbances: Iterable[str], seeds: range) -> list[str]:
@@ -114,21 +84,14 @@ def rivals(seeds: range, only: tuple[str, ...]) -> str:
 
 
 def main() -> None:
-    """Drive and write the tables."""
+    """Drive and write the table."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=8)
-    parser.add_argument("--rivals", nargs="*", metavar="LAW")
-    parser.add_argument("--only", choices=ESTIMATORS)
+    parser.add_argument("--only", nargs="*", metavar="LAW", default=())
     options = parser.parse_args()
-    if options.rivals is not None:
-        first = CHOOSING_SEEDS[0]
-        made = rivals(range(first, first + options.seeds), tuple(options.rivals))
-        put(DOCS / "systems.md", made, "rivals")
-        return
-    seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + options.seeds)
-    for estimator in (options.only,) if options.only else ESTIMATORS:
-        print(estimator, flush=True)
-        put(DOCS / "systems.md", crossed(estimator, seeds), estimator)
+    first = CHOOSING_SEEDS[0]
+    made = rivals(range(first, first + options.seeds), tuple(options.only))
+    put(DOCS / "systems.md", made, "rivals")
 
 
 if __name__ == "__main__":
