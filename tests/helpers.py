@@ -5,8 +5,10 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import marshal
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -153,3 +155,15 @@ def installed(policies):
     missing = importlib.util.find_spec("casadi") is None
     skip = pytest.mark.skipif(missing, reason="nmpc needs casadi, of the optional extra mpc")
     return [pytest.param(name, marks=skip if name.startswith("nmpc") else ()) for name in policies]
+
+
+def benched(folder: Path, plan: str, words: str) -> Path:
+    """The results of ``tlf bench`` with a plan, in a folder below the given one."""
+    from baselines.cli import main
+
+    (folder / "plan.yaml").write_text(plan)
+    with pytest.MonkeyPatch.context() as patch:
+        given = f"bench --plan {folder}/plan.yaml --no-figures --processes 1 --out {folder}/made {words}"
+        patch.setattr(sys, "argv", ["tlf", *given.split()])
+        main()
+    return folder / "made"

@@ -67,7 +67,9 @@ print(json.dumps([found, [name for name, one in stats.items() if one.cache_misse
 """
 
 
-@pytest.mark.skipif(cache_folder() is None, reason="no compiled code is kept on this machine")
+@pytest.mark.skipif(
+    cache_folder() is None, reason="no folder for compiled code can be written here"
+)
 def test_after_it_an_episode_finds_everything_in_the_cache():
     compile_command.in_two_processes(compile_command.USUAL)
     done = subprocess.run(

@@ -210,7 +210,25 @@ def test_runs_are_left_only_when_too_many_have_failed():
     assert line["position_rmse_mm"] is None
     easy = run_probe(plan, Probe("reference:tuned", "infinity", "friction", 0.2))
     assert (easy["failed"], easy["stopped"]) == (0, False)
-    assert 0 < easy["position_rmse_mm"] < 100
+    knob = load_knob("friction").scenario("infinity", 0.2, 10.0)
+    tuned = fit_policy("reference:tuned", knob)
+    runs = [one.metrics() for one in run_seeds(tuned.scenario, tuned.policy, seeds)]
+    for metric, of_run in (
+        ("position_rmse_mm", lambda run: max(one.position_rmse_mm for one in run)),
+        ("torque_rms_Nmm", lambda run: max(one.torque_rms_Nmm for one in run)),
+        ("time_gap_rmse_s", lambda run: max(one.time_gap_rmse_s for one in run[1:])),
+        ("energy_J", lambda run: run[0].energy_J + run[1].energy_J + run[2].energy_J),
+    ):
+        assert easy[metric] == pytest.approx(sorted(map(of_run, runs))[1])
+        assert line[metric] is None
+
+
+def test_the_usual_level_is_the_last_coarse_one_up_to_1():
+    found = grid((0.2, 2.0), 0.05)
+    coarse = [found.levels[i] for i in found.first]
+    assert found.usual in coarse
+    assert found.usual <= 1 < coarse[coarse.index(found.usual) + 1]
+    assert grid((1.5, 3.0), 0.05).usual == 1.5
 
 
 def made_up(plan, probe):

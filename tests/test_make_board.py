@@ -10,13 +10,13 @@ import pytest
 pytest.importorskip("arch")
 pytest.importorskip("matplotlib")
 
-from baselines.cli import main
+from helpers import benched
 
 ROOT = Path(__file__).parent.parent
 sys.path.insert(0, str(ROOT / "docs" / "figures"))
 make_board = importlib.import_module("make_board")
 
-WORDS = "--horizon-s 12 --seeds 20000:20003 --disturbances nominal,start --processes 1"
+WORDS = "--horizon-s 12 --seeds 20000:20003 --disturbances nominal,start"
 PAGES = (
     "README.md",
     "docs/leaderboard.md",
@@ -36,15 +36,8 @@ PAGES = (
 @pytest.fixture(scope="module")
 def made(tmp_path_factory):
     """A small benchmark."""
-    folder = tmp_path_factory.mktemp("results")
-    (folder / "small.yaml").write_text(
-        "policies: [reference:tuned, pure_pursuit]\ntasks: infinity\nplant: batch\n"
-    )
-    with pytest.MonkeyPatch.context() as patch:
-        arguments = f"bench --plan {folder}/small.yaml {WORDS} --no-figures --out {folder}/board"
-        patch.setattr(sys, "argv", ["tlf", *arguments.split()])
-        main()
-    return folder / "board"
+    plan = "policies: [reference:tuned, pure_pursuit]\ntasks: infinity\nplant: batch\n"
+    return benched(tmp_path_factory.mktemp("results"), plan, WORDS)
 
 
 @pytest.fixture

@@ -10,9 +10,11 @@ import pytest
 pytest.importorskip("arch")
 pytest.importorskip("matplotlib")
 
+from helpers import benched
+
 from baselines.benchmark.bench import run_episode
 from baselines.benchmark.plan import Episode, Plan, read_plan
-from baselines.cli import PLAN_OPTIONS, main
+from baselines.cli import PLAN_OPTIONS
 from baselines.policies.systems import parse_system
 
 ROOT = Path(__file__).parent.parent
@@ -77,17 +79,12 @@ def test_every_system_has_its_row_on_the_table_of_its_estimator():
 
 @pytest.fixture(scope="module")
 def results(tmp_path_factory):
-    folder = tmp_path_factory.mktemp("crossed")
-    (folder / "plan.yaml").write_text(
+    plan = (
         "policies: {controllers: [kanayama], estimators: [ekf, truth], limiters: [none]}\n"
-        "tasks: infinity\ndisturbances: [nominal, ice]\nseeds: '20000:20002'\n"
-        "horizon_s: 12\nplant: batch\n"
+        "tasks: infinity\ndisturbances: [nominal, ice]\nplant: batch\n"
     )
-    with pytest.MonkeyPatch.context() as patch:
-        words = f"bench --plan {folder}/plan.yaml --no-figures --processes 1 --out {folder}/made"
-        patch.setattr(sys, "argv", ["tlf", *words.split()])
-        main()
-    return folder / "made"
+    words = "--seeds 20000:20002 --horizon-s 12"
+    return benched(tmp_path_factory.mktemp("crossed"), plan, words)
 
 
 def test_results_make_the_page_twice_alike(results, tmp_path):

@@ -20,7 +20,8 @@ import numpy as np
 from scipy.stats import binom
 
 from baselines.benchmark.envelope import CONFIDENCE, HELD_SHARE, Envelope, Probe, envelope
-from baselines.benchmark.envelope_runs import COSTS, PLAN_FILE, EnvelopeResults
+from baselines.benchmark.envelope_runs import PLAN_FILE, EnvelopeResults, middle
+from baselines.benchmark.lines import BESIDE
 from baselines.benchmark.page import figure_title, number, policy_label
 from baselines.benchmark.sweep_figure import unit_of
 from tlf_env.common.files import atomic
@@ -62,7 +63,7 @@ def envelope_board(results: EnvelopeResults, command: str = "") -> dict[str, Any
                 "overrides": lines[0]["overrides"] if lines else {},
                 "tested": len(lines),
                 "usual": found.usual,
-                **{name: usual.get(name) for name in COSTS},
+                **{name: usual.get(name) for name in BESIDE},
             }
         )
     policies = [policy_row(name, cells) for name in plan.policies]
@@ -97,14 +98,8 @@ def policy_row(policy: str, cells: Sequence[Mapping[str, Any]]) -> dict[str, Any
         "below_first": sum(cell["level"] is None for cell in mine),
         "beyond_last": sum(cell["beyond"] for cell in mine),
         "knobs": len(mine),
-        **{name: middle([cell[name] for cell in mine]) for name in COSTS},
+        **{name: middle([cell[name] for cell in mine]) for name in BESIDE},
     }
-
-
-def middle(values: Sequence[float | None]) -> float | None:
-    """Median of the values that are not None."""
-    known = [value for value in values if value is not None]
-    return float(np.median(known)) if known else None
 
 
 def comparisons(

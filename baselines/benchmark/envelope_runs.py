@@ -22,6 +22,7 @@ from baselines.benchmark.envelope import (
     most_left,
     untested,
 )
+from baselines.benchmark.lines import BESIDE, beside
 from baselines.benchmark.results import append_line, read_lines
 from baselines.policies.registry import fit_policy, policy_hash
 from baselines.runs.jobs import claim, spread
@@ -29,23 +30,17 @@ from baselines.runs.outcome import failed
 from baselines.runs.provenance import git_revision, physics_digest, simulation_digest, versions
 from baselines.runs.run import run_seeds, seed_blocks
 from tlf_env.numerics.philox import checked_seed
-from tlf_env.task.metrics import RobotMetrics
 from tlf_env.task.neutral import scenario_hash
 
 LEVELS_FILE, PLAN_FILE = "levels.jsonl", "envelope_plan.json"
 CLAIMED = ("plan", "knobs", "policies", "scenarios", "simulation")
 SECONDS_DIGITS = 2
-COSTS = ("energy_J", "torque_rms_Nmm", "time_gap_rmse_s")  # of a run, beside its error
 
 
-def costs_of(metrics: Sequence[RobotMetrics]) -> dict[str, float]:
-    """Energy of all robots together (J), torque RMS (N·mm) and time gap RMS (s) of the worst robot of a run."""
-    gaps = [robot.time_gap_rmse_s for robot in metrics if robot.time_gap_rmse_s is not None]
-    return {
-        "energy_J": sum(robot.energy_J for robot in metrics),
-        "torque_rms_Nmm": max(robot.torque_rms_Nmm for robot in metrics),
-        "time_gap_rmse_s": max(gaps, default=0.0),
-    }
+def middle(values: Sequence[float | None]) -> float | None:
+    """Median of the values that are not None."""
+    known = [value for value in values if value is not None]
+    return float(np.median(known)) if known else None
 
 
 def run_probe(plan: EnvelopePlan, probe: Probe) -> dict[str, Any]:
@@ -58,8 +53,7 @@ def run_probe(plan: EnvelopePlan, probe: Probe) -> dict[str, Any]:
     fitted = fit_policy(probe.policy, plan.scenario(probe), trust=plan.trust)
     most = plan.counts.held if plan.counts.high is None else plan.counts.high
     lost, stopped = 0, False
-    errors: list[float] = []
-    costs: list[dict[str, float]] = []
+    robots_of_runs: list[list[dict[str, Any]]] = []
     for seeds in seed_blocks(range(*plan.seeds)):
         runs = 0
         for record in run_seeds(
@@ -68,8 +62,7 @@ def run_probe(plan: EnvelopePlan, probe: Probe) -> dict[str, Any]:
             runs += 1
             metrics = record.metrics()
             lost += failed(metrics)
-            errors.append(max(robot.position_rmse_mm or 0.0 for robot in metrics))
-            costs.append(costs_of(metrics))
+            robots_of_runs.append([robot._asdict() for robot in metrics])
             if lost > most:
                 break
         if not runs:  # more than most - lost runs of the block have failed
@@ -81,10 +74,9 @@ def run_probe(plan: EnvelopePlan, probe: Probe) -> dict[str, Any]:
         **probe._asdict(),
         "failed": lost,
         "stopped": stopped,
-        "position_rmse_mm": None if stopped else float(np.median(errors)),
         **{
-            name: None if stopped else float(np.median([run[name] for run in costs]))
-            for name in COSTS
+            metric: None if stopped else middle([beside(run, metric) for run in robots_of_runs])
+            for metric in BESIDE
         },
         "scenario_hash": scenario_hash(fitted.scenario),
         "physics": physics_digest(),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +13,13 @@ Line = dict[str, Any]
 # A stratum, for which runs over seeds are compared: task, disturbance, value of the swept knob.
 Stratum = tuple[str, str, float | None]
 Strata = dict[Stratum, list[Line]]  # runs of one policy
+# What is shown beside a score: the worst robot's value, and the energy of all robots together.
+BESIDE: dict[str, Callable[[list[float]], float]] = {
+    "position_rmse_mm": max,
+    "time_gap_rmse_s": max,
+    "torque_rms_Nmm": max,
+    "energy_J": sum,
+}
 
 
 def failures(lines: Sequence[Line]) -> int:
@@ -24,6 +31,12 @@ def worst(line: Line, metric: str) -> float | None:
     """A run's value of a metric at its worst robot; None if undefined for all robots."""
     values = [robot[metric] for robot in line["robots"] if robot[metric] is not None]
     return max(values, default=None)
+
+
+def beside(robots: Sequence[Mapping[str, Any]], metric: str) -> float | None:
+    """A run's value of a metric of :data:`BESIDE`; None if undefined for all robots."""
+    values = [robot[metric] for robot in robots if robot[metric] is not None]
+    return BESIDE[metric](values) if values else None
 
 
 def run_score(line: Line) -> float:

@@ -8,13 +8,13 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
 from scipy.stats import binomtest, wilcoxon
 
-from baselines.benchmark.lines import Line, step_times, worst
+from baselines.benchmark.lines import BESIDE, Line, beside, step_times, worst
 from baselines.benchmark.results import Results
 from baselines.benchmark.statistics import interval, median, rate
 from baselines.benchmark.testset import severity_of
@@ -24,14 +24,6 @@ from baselines.runs.outcome import failed
 CAP_MM = 500.0  # also the error of a failed run
 LEAST_MM = 0.1
 SEVERITIES = ((0.0, 1 / 3), (1 / 3, 2 / 3), (2 / 3, 1.0))
-BESIDE: dict[
-    str, Callable[[list[float]], float]
-] = {  # further columns: metric, and how the robots of a run are combined
-    "position_rmse_mm": max,
-    "time_gap_rmse_s": max,
-    "torque_rms_Nmm": max,
-    "energy_J": sum,
-}
 
 
 def case_error_mm(line: Line) -> float:
@@ -97,18 +89,9 @@ def entry_table(policy: str, lines: Sequence[Line], severities: dict[int, float]
         "held": rate(sum(held), len(held)),
         "held_by_severity": by_severity,
         "score": {"mm": geometric_mean(errors), "interval": interval(errors, geometric_mean)},
-        **{
-            metric: median([_combined(line, metric, how) for line in lines])
-            for metric, how in BESIDE.items()
-        },
+        **{metric: median([beside(line["robots"], metric) for line in lines]) for metric in BESIDE},
         **({"step_ms": times} if (times := step_times(lines)) else {}),
     }
-
-
-def _combined(line: Line, metric: str, how: Callable[[list[float]], float]) -> float | None:
-    """A metric over the robots of a run; None if undefined for all."""
-    values = [robot[metric] for robot in line["robots"] if robot[metric] is not None]
-    return how(values) if values else None
 
 
 def difference(mine: Sequence[Line], theirs: Sequence[Line]) -> dict[str, Any]:

@@ -45,7 +45,7 @@ Board = dict[str, Any]
 Line = dict[str, Any]
 
 
-def read_results(folder: Path) -> tuple[Board, list[Line]]:
+def read_results(folder: Path, plan: str = "board") -> tuple[Board, list[Line]]:
     """Read the output of ``tlf bench``: the leaderboard, and one line per episode of the plan.
 
     Raises
@@ -53,7 +53,7 @@ def read_results(folder: Path) -> tuple[Board, list[Line]]:
     ValueError
         if a file or an episode is missing, or the leaderboard belongs to another plan.
     """
-    hint = f"tlf bench --plan board --out {folder}"
+    hint = f"tlf bench --plan {plan} --out {folder}"
     for name in (PLAN_FILE, RUNS_FILE, BOARD_FILE):
         if not (folder / name).is_file():
             raise ValueError(f"{folder} has no {name}; run: {hint}")
@@ -214,7 +214,7 @@ def write_board(results: Path, root: Path = ROOT, name: str = "board") -> None:
     ValueError
         as in :func:`read_results` and :func:`with_part`, before any file is written.
     """
-    board, lines = read_results(results)
+    board, lines = read_results(results, name)
     readme = (root / "README.md").read_text("utf-8")
     if name == "board":
         readme = with_part(readme, readme_part(board))

@@ -110,9 +110,11 @@ def write_crossing(folders: list[Path], root: Path = ROOT) -> None:
     """
     cells: list[Cell] = []
     lines: list[Line] = []
+    shared: tuple[str, ...] = ()
     for folder in folders:
-        board, found = read_results(folder)
-        if plan_of(board).disturbances != plan_of(read_results(folders[0])[0]).disturbances:
+        board, found = read_results(folder, "crossing")
+        shared = shared or plan_of(board).disturbances
+        if plan_of(board).disturbances != shared:
             raise ValueError(f"{folder} has other disturbances than {folders[0]}")
         cells += map(kept, board["cells"])
         lines += slice_of(found)
