@@ -148,10 +148,10 @@ def test_the_best_of_a_column_fails_least_and_then_errs_least():
         "cells": cells,
         "policies": [{"policy": one["policy"], "score": {"iqm": 1.0}} for one in cells],
     }
-    shown = [
-        row.split("|")[2].strip() for row in make_board.readme_table(board, "infinity").split("\n")
-    ]
-    assert shown[2:] == ["**3.0**", "**3.0**", "0.5 (1)", "(50)", "(100)"]  # a tie as it is shown
+    rows = [row.split("|") for row in make_board.readme_table(board, "infinity").split("\n")][2:]
+    shown = [row[2].strip() for row in rows]
+    assert shown == ["**3.0**", "**3.0**", "0.5 (1)", "(50)", "(100)"]  # a tie as it is shown
+    assert [int(row[3]) for row in rows] == [0, 0, 1, 50, 100]  # failed runs of all tasks
 
 
 def test_no_policy_is_best_where_all_runs_fail():

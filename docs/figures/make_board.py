@@ -30,6 +30,7 @@ README_DISTURBANCES = (
     "nominal",
     "noise",
     "slip",
+    "slip-ramps",
     "slip-noise",
     "ice",
     "start",
@@ -155,13 +156,14 @@ def readme_table(board: Board, task: str) -> str:
     out = [
         f"| {TASK_NAMES.get(task, task)}, {load_scenario(task).robot_count} robots | "
         + " | ".join(columns)
-        + " | score, all tasks |",
-        "|---|" + "---:|" * (len(columns) + 1),
+        + " | failed, all | score, all |",
+        "|---|" + "---:|" * (len(columns) + 2),
     ]
     for row in board["policies"]:
         name = row["policy"]
         texts = [shown(cells[name, column], best[column]) for column in columns]
-        out.append(f"| `{name}` | {' | '.join(texts)} | {row['score']['iqm']:.1f} |")
+        failed = sum(failures(cell) for cell in board["cells"] if cell["policy"] == name)
+        out.append(f"| `{name}` | {' | '.join(texts)} | {failed} | {row['score']['iqm']:.1f} |")
     return "\n".join(out)
 
 
@@ -169,6 +171,7 @@ def readme_part(board: Board) -> str:
     """The text between the README's markers."""
     plan = board["plan"]["plan"]
     first, end = plan["seeds"]
+    places = len(plan_of(board).places)
     horizon = dict(map(tuple, plan["overrides"])).get("horizon_s")
     length = "" if horizon is None else f" of {horizon:g} s"
     tasks = [task for task in README_TASKS if task in plan["tasks"]] or plan["tasks"]
@@ -176,8 +179,8 @@ def readme_part(board: Board) -> str:
     return (
         f"Position RMS of the worst robot in mm, median over {end - first} runs{length}. In brackets: the "
         "number of *failed* runs (a robot is lost or touches another); if at least half fail, only this "
-        "number is given. **Bold**: fewest failures, then smallest error. Score: interquartile mean (IQM) "
-        f"from 0 to 100 over all {len(plan_of(board).places)} pairs of task and disturbance.\n\n"
+        f"number is given. **Bold**: fewest failures, then smallest error. *All*: the {places} pairs of task "
+        f"and disturbance, {places * (end - first)} runs; the score is an interquartile mean from 0 to 100.\n\n"
         f"{tables}\n\n"
         "All disturbances, intervals, and the command that reproduces them: "
         "[docs/leaderboard.md](docs/leaderboard.md)."
