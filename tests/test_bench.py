@@ -426,6 +426,15 @@ def test_an_error_in_a_worker_is_not_swallowed(tmp_path, monkeypatch):
         run_bench(plan, tmp_path / "out", processes=2)
 
 
+def test_small_panels_share_a_column():
+    pytest.importorskip("matplotlib")
+    from baselines.benchmark.figures import _columns
+
+    rows = {"a": 22, "b": 22, "c": 3, "d": 2, "e": 18}
+    assert _columns(rows) == [["a"], ["b"], ["c", "d"], ["e"]]
+    assert _columns({}) == []
+
+
 def test_the_figures_are_drawn_from_what_the_table_holds(tmp_path):
     pytest.importorskip("matplotlib")
     from baselines.benchmark.figures import write_bench_figures

@@ -9,6 +9,7 @@ used.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -31,7 +32,7 @@ from baselines.benchmark.sweep_figure import draw_sweep
 from baselines.runs.style import DPI, PALE
 from tlf_env.common.files import atomic
 
-ROW_IN, POLICY_IN = 0.3, 0.16  # height of a disturbance, and of each policy within it
+ROW_IN, POLICY_IN = 0.25, 0.09  # height of a disturbance, and of each policy within it
 PANEL_IN = 4.4
 SPREAD = 0.7  # share of a disturbance's row that its policies use
 
@@ -97,16 +98,22 @@ def _by_stratum(
     tasks = tasks_of(board)
     rows = {task: list(dict.fromkeys(map(_row, cells_of(board, task)))) for task in tasks}
     names = policies(board)
-    row_in = ROW_IN + POLICY_IN * len(names)
-    most = max(map(len, rows.values()), default=1)
+    columns = _columns({task: len(rows[task]) for task in tasks})
+    most = max((sum(len(rows[task]) for task in column) for column in columns), default=1)
     figure = new_figure(
         board,
-        1.8 + PANEL_IN * max(len(tasks), 1),
-        1.1 + row_in * most,
+        1.8 + PANEL_IN * max(len(columns), 1),
+        1.1 + (ROW_IN + POLICY_IN * len(names)) * most,
         "95 % intervals",
     )
-    grid = figure.subplots(1, max(len(tasks), 1), sharex=True, sharey=False, squeeze=False)[0]
-    for axes, task in zip(grid, tasks, strict=False):
+    grid = []
+    outer = figure.add_gridspec(1, max(len(columns), 1))
+    for place, column in enumerate(columns):
+        heights = [len(rows[task]) for task in column]
+        spare = [most - sum(heights)] if sum(heights) < most else []
+        inner = outer[place].subgridspec(len(heights + spare), 1, height_ratios=heights + spare)
+        grid += [figure.add_subplot(inner[i]) for i in range(len(column))]
+    for axes, task in zip(grid, chain.from_iterable(columns), strict=True):
         for k in range(0, len(rows[task]), 2):
             axes.axhspan(k - 0.5, k + 0.5, color=PALE, alpha=0.45, lw=0, zorder=0)
         for cell in cells_of(board, task):
@@ -123,6 +130,16 @@ def _by_stratum(
         axes.grid(axis="y", visible=False)
     legend_below(board, figure)
     return figure
+
+
+def _columns(rows: dict[str, int]) -> list[list[str]]:
+    """Tasks in columns, one below the other where they fit beside the one with the most rows."""
+    columns: list[list[str]] = []
+    for task, count in rows.items():
+        if not columns or sum(rows[one] for one in columns[-1]) + count > max(rows.values()):
+            columns.append([])
+        columns[-1].append(task)
+    return columns
 
 
 def _row(cell: dict[str, Any]) -> str:

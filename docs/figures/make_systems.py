@@ -21,7 +21,7 @@ from tlf_env.task.scenario import load_scenario
 
 NAMES = (
     "reference:tuned+ekf-gyro-smoothed+grip",
-    *(f"{law}:searched+ekf-gyro-smoothed+grip" for law in LAWS),
+    *(f"{law}:bounded+ekf-gyro-smoothed+grip" for law in LAWS),
 )
 ROBOTS, HORIZON_S = 5, 20.0
 
