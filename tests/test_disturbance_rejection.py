@@ -6,6 +6,8 @@ import gymnasium
 import numpy as np
 import pytest
 
+import tlf_env
+from baselines import ReferencePolicy
 from baselines.policies.laws.disturbance_rejection import DisturbanceRejection
 from baselines.policies.laws.law import ErrorBounds
 from baselines.policies.laws.textbook import FeedbackLinearisation
@@ -127,3 +129,64 @@ def test_a_reset_of_the_environment_clears_the_memory_of_the_others():
     first = rewards(3)
     rewards(4)
     assert rewards(3) == first
+
+
+def test_the_reference_with_rejection_keeps_its_state_and_starts_anew_without():
+    policy = ReferencePolicy("adrc")
+    speeds = ("reference_u_1", "command_u_1", "odometry_u_1", "u_1_in_0.5_s")
+    moving = dict.fromkeys(speeds, 300.0) | {"cos_e_3": 1.0, "is_leader": 1.0}
+    moving["odometry_u_1"] = 280.0
+    row = [moving.get(name, 0.0) / entry.scale for name, entry in ENTRIES.items()]
+    rows = np.tile(row, (4, 1))
+    rows[:, 0] += [0.001, 0.002, 0.003, 0.004]  # e_1
+    first, state = policy.predict(rows)
+    assert state.shape == (4, 7)
+    assert (state[:, D_1] == 0).all()
+    kept = state.copy()
+    second, later = policy.predict(rows, state)
+    np.testing.assert_array_equal(state, kept)  # the given state is not changed
+    assert (later[:, D_1] != 0).all()
+    assert (first != second).any()
+    start = np.array([True, False, True, False])
+    mixed, _ = policy.predict(rows, state, start)
+    np.testing.assert_array_equal(mixed[start], first[start])
+    np.testing.assert_array_equal(mixed[~start], second[~start])
+    with pytest.raises(ValueError, match=r"the state must be of the shape \(4, 7\), got \(3, 7\)"):
+        policy.predict(rows, state[:3])
+
+
+def test_without_rejection_the_state_is_passed_through():
+    rows = np.zeros((2, len(ENTRIES)), dtype=np.float32)
+    assert ReferencePolicy("linearised").predict(rows, "anything")[1] == "anything"
+
+
+def test_the_observer_in_the_engine_starts_anew_with_each_episode():
+    """The same seed after another one: the same run, bit for bit."""
+    env = gymnasium.make(
+        "tlf_env/Infinity-v0", residual_base="adrc", action="residual", disturbance="slip"
+    )
+
+    def seen(seed):
+        env.reset(seed=seed)
+        return [env.step(np.zeros(2, dtype=np.float32))[0].tobytes() for _ in range(120)]
+
+    first = seen(3)
+    seen(4)
+    assert seen(3) == first
+
+
+def test_a_residual_of_zero_is_the_law_with_its_memory():
+    """What the engine keeps is what the policy keeps: a residual of zero drives as the policy does."""
+    options = {"disturbance": "slip", "horizon_s": 3.0}
+    by_engine = tlf_env.parallel_env("infinity", action="residual", residual_base="adrc", **options)
+    by_policy = tlf_env.parallel_env("infinity", **options)
+    policy, state = ReferencePolicy("adrc"), None
+    zero = dict.fromkeys(by_engine.possible_agents, np.zeros(2, dtype=np.float32))
+    seen, _ = by_policy.reset(seed=1)
+    by_engine.reset(seed=1)
+    while by_policy.agents:
+        actions, state = policy.predict(np.stack([seen[one] for one in by_policy.agents]), state)
+        seen, *_, infos = by_policy.step(dict(zip(by_policy.agents, actions, strict=True)))
+        others = by_engine.step(zero)[4]
+        assert {k: v["x_mm"] for k, v in others.items()} == {k: v["x_mm"] for k, v in infos.items()}
+    assert np.abs(state[:, D_1]).max() > 1.0

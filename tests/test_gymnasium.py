@@ -338,6 +338,7 @@ def test_wrappers_see_what_they_expect() -> None:
         {"dtype": "float64"},
         {"observation": "sensor"},
         {"residual_base": "printed"},
+        {"residual_base": "adrc"},  # a law with a memory
         {"cooperative": True},
     ],
     ids=str,
@@ -350,12 +351,14 @@ def test_the_reference_among_others_is_the_reference_policy_bitwise(
     together = tlf_env.parallel_env("infinity", **options)
     seen, info = alone.reset(seed=2)
     seen_by_all, infos = together.reset(seed=2)
+    state = None
     for _ in range(250):
         assert np.array_equal(seen, seen_by_all[learner])
         assert info == infos[learner]
         # What drives is made from `tracking`, whatever the learner sees.
         rows = together.formation.arrays.observations[0]
-        actions = dict(zip(together.agents, policy.predict(rows)[0], strict=True))
+        chosen, state = policy.predict(rows, state)
+        actions = dict(zip(together.agents, chosen, strict=True))
         seen, reward, terminated, truncated, info = alone.step(actions[learner])
         seen_by_all, rewards, ends, cuts, infos = together.step(actions)
         assert (reward, terminated, truncated) == (rewards[learner], ends[learner], cuts[learner])

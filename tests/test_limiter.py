@@ -408,10 +408,10 @@ def test_gains_alone_are_a_controller_without_limits():
 
 def test_an_unknown_name_is_reported_with_those_there_are():
     with pytest.raises(
-        ValueError, match=r"'bold' is not one of consistent, linearised, printed, tuned"
+        ValueError, match=r"'bold' is not one of adrc, consistent, linearised, printed, tuned"
     ):
         controller("bold")
     with pytest.raises(
-        ValueError, match=r"'bold' is not one of consistent, linearised, printed, tuned"
+        ValueError, match=r"'bold' is not one of adrc, consistent, linearised, printed, tuned"
     ):
         load_scenario("infinity", residual_base="bold")

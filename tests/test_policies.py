@@ -167,7 +167,7 @@ def test_a_controller_file_may_ask_for_its_filter(tmp_path):
     [
         (None, "cannot read"),
         ("gains: {}", "controller: Field required"),
-        ("controller: bold", "'bold' is not one of consistent, linearised, printed, tuned"),
+        ("controller: bold", "'bold' is not one of adrc, consistent, linearised, printed, tuned"),
         ("controller: {gains: {k_1_per_s: -1}}", "controller.gains.k_1_per_s"),
         ("controller: tuned\nestimator: own:Filter", "estimator"),
         ("controller: tuned\nekf: {}", "ekf: unknown key"),
@@ -228,7 +228,7 @@ def test_the_stack_has_the_papers_law_alone():
     with pytest.raises(ValueError, match=r"gains consistent, printed; 'tuned' needs limits"):
         StackPolicy(scenario, "tuned")
     with pytest.raises(
-        ValueError, match=r"'bold' is not one of consistent, linearised, printed, tuned, nor"
+        ValueError, match=r"'bold' is not one of adrc, consistent, linearised, printed, tuned, nor"
     ):
         StackPolicy(scenario, "bold")
 

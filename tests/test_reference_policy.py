@@ -20,7 +20,7 @@ WHOLE = len(tracking_entries(DEFAULT_PREVIEW_S))
 NEEDED = ("e_1", "e_2", "sin_e_3", "cos_e_3", "reference_u_1", "reference_u_2")
 
 presets = pytest.mark.parametrize("preset", ["consistent", "printed"])
-every = pytest.mark.parametrize("preset", ["consistent", "printed", "tuned", "linearised"])
+every = pytest.mark.parametrize("preset", ["consistent", "printed", "tuned", "linearised", "adrc"])
 
 
 def batch(rows: int = 64, entries: int = ENTRIES, seed: int = 0) -> np.ndarray:

@@ -96,7 +96,7 @@ def test_a_path_with_a_plus_is_still_one_controller(tmp_path):
     ("name", "said"),
     [
         ("kanayana+ekf", "controller 'kanayana' is not one of .*; did you mean 'kanayama'?"),
-        ("residual+ekf", "controller 'residual' is not one of reference:consistent, "),
+        ("residual+ekf", "controller 'residual' is not one of reference:adrc, "),
         ("reference:tund+ekf", "controller 'reference:tund' is .*; did you mean 'reference:tuned'"),
         ("kanayama:bold+ekf", "controller 'kanayama:bold' is not one of"),
         ("reference:+ekf+none", "controller 'reference:' is not one of"),
@@ -142,12 +142,13 @@ def test_a_lead_needs_a_preview():
             make_policy(name, load_scenario(preview_s=()))
 
 
+WITH_LIMITS = ("reference:adrc", "reference:linearised", "reference:tuned")
+
+
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 @pytest.mark.parametrize(
     "name",
-    installed(
-        one for one in policy_names() if one not in ("reference:linearised", "reference:tuned")
-    ),
+    installed(one for one in policy_names() if one not in WITH_LIMITS),
 )
 def test_without_a_limiter_the_laws_twist_is_commanded(name, dtype):
     alone = make_policy(name, SCENARIO).predict(rows(dtype))[0]
@@ -172,10 +173,13 @@ def test_the_tuned_reference_is_the_sum_of_its_parts(tmp_path):
     assert bare.controller.limits.yaw_rate_rad_s is None
 
 
-def test_the_linearised_reference_is_a_system_of_a_textbooks_law():
+@pytest.mark.parametrize(
+    ("preset", "law"), [("linearised", "feedback_linearisation:bounded"), ("adrc", "adrc:searched")]
+)
+def test_a_reference_is_a_system_of_a_law(preset, law):
     """One compiled law, in a controller and behind a limiter: the same bits."""
-    name = "feedback_linearisation:bounded+ekf-gyro-smoothed+grip"
-    alone, system = (fit_policy(one, SCENARIO) for one in ("reference:linearised", name))
+    name = f"{law}+ekf-gyro-smoothed+grip"
+    alone, system = (fit_policy(one, SCENARIO) for one in (f"reference:{preset}", name))
     assert (alone.overrides, system.overrides) == ({}, {"broadcast_smoothing_s": 0.1})
     assert alone.scenario.smoothing_s == 0.1
     assert load_scenario(alone.scenario, broadcast_smoothing_s=0.1) == system.scenario
@@ -184,6 +188,9 @@ def test_the_linearised_reference_is_a_system_of_a_textbooks_law():
     first, second = (run_policy(one.scenario, one.policy, 3) for one in (system, alone))
     for column, values in first.columns.items():
         np.testing.assert_array_equal(values, second[column], err_msg=column)
+
+
+def test_a_controller_has_one_law():
     with pytest.raises(ValueError, match="gains and linearisation exclude each other"):
         Controller(gains={"k_1_per_s": 0.4}, linearisation={"ahead_mm": 80.0, "gain_per_s": 1.0})
 

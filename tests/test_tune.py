@@ -347,7 +347,7 @@ def test_a_ray_cluster_drives_the_same_trials(tmp_path):
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        ({"start": "bold"}, "'bold' is not one of consistent, linearised, printed, tuned"),
+        ({"start": "bold"}, "'bold' is not one of adrc, consistent, linearised, printed, tuned"),
         ({"start": {"gains": {"k_9": 1}}}, "start.gains.k_9: unknown key"),
         ({"start": "printed"}, "the start has 6.91667e-05; it must lie within 0.8 and 12"),
         (

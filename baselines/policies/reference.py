@@ -1,4 +1,4 @@
-"""The reference controllers as a policy: a pure function of the ``tracking`` observation."""
+"""The reference controllers as a policy, from the ``tracking`` observation and the state of its law, if any."""
 
 from __future__ import annotations
 
@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from baselines.policies.columns import find_columns
+from baselines.policies.memory import next_memory
 from tlf_env.common.presets import is_file_name
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for, load_controller
+from tlf_env.onboard.rejection import RejectionState, read_rejection_of, write_rejection_of
 from tlf_env.onboard.supervisor import Neighbour, Supervisor, SupervisorRow, supervisor_row
 from tlf_env.onboard.tracking import (
     Controller,
@@ -30,10 +32,13 @@ def _actions(
     scales: np.ndarray,
     row: ControllerRow,
     supervisor: SupervisorRow,
+    memory: np.ndarray,
     out: np.ndarray,
 ) -> None:
     for i in range(rows.shape[0]):
-        u_1, u_2 = wanted_twist(rows[i], scales, row)
+        before = read_rejection_of(memory, i)
+        u_1, u_2, after = wanted_twist(rows[i], scales, row, before)
+        write_rejection_of(memory, i, after)
         u_1, u_2 = allowed_twist(rows[i], scales, row, supervisor, u_1, u_2)
         out[i, 0], out[i, 1] = twist_action(rows[i], scales, row, u_1, u_2)
 
@@ -113,13 +118,14 @@ class ReferencePolicy:
     ) -> tuple[np.ndarray, Any]:
         """Action for one ``tracking`` observation ``(entry,)`` or a batch ``(batch, entry)``.
 
-        Returns the action, in the observation's dtype and within [−1, 1], and ``state`` unchanged, as
-        the law has no memory.
+        Returns the action, in the observation's dtype and within [−1, 1], and the next state: ``state``
+        unchanged, or for a law with ``rejection`` what its observer keeps, ``(row, 7)``. Without the last
+        state such a law starts anew and subtracts nothing.
 
         Raises
         ------
         ValueError
-            if the observation is not a ``tracking`` observation.
+            if the observation is not a ``tracking`` observation, or the state is of another number of rows.
         """
         observation = np.asarray(observation)
         if observation.ndim not in (1, 2) or observation.shape[-1] < self._needed:
@@ -133,5 +139,10 @@ class ReferencePolicy:
             rows = self._columns.take(rows)
         rows = np.ascontiguousarray(rows)
         action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
-        _actions(rows, self._scales, self._row, self._supervisor_row, action)
+        remembers = self._row.rejection.at_once > 0.0
+        given = (state, episode_start) if remembers else (None, None)
+        memory = next_memory(given[0], (len(rows), len(RejectionState._fields)), given[1])
+        _actions(rows, self._scales, self._row, self._supervisor_row, memory.T, action)
+        if remembers:
+            state = memory
         return (action[0] if observation.ndim == 1 else action), state

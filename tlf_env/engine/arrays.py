@@ -159,6 +159,7 @@ read_wanted_before = array_reader("wanted_before")
 write_wanted_before = array_writer("wanted_before")
 read_command, write_command = array_reader("command"), array_writer("command")
 read_observer, write_observer = array_reader("observer"), array_writer("observer")
+read_rejection, write_rejection = array_reader("rejection"), array_writer("rejection")
 read_start, write_start = array_reader("start"), array_writer("start")
 
 

@@ -17,10 +17,12 @@ from tlf_env.engine.arrays import (
     read_body,
     read_contact,
     read_motion,
+    read_rejection,
     read_trace,
     read_traction,
     read_wanted,
     write_command,
+    write_rejection,
     write_trace,
     write_wanted,
     write_wanted_before,
@@ -85,7 +87,9 @@ def command(arrays: Arrays, lane: int, robot: int, settings: Settings) -> tuple[
     belief = read_belief(arrays.constants, robot, lane)
     if kind == RESIDUAL:
         seen, given = arrays.observations[lane, robot], arrays.twists[lane, robot]
-        u_1, u_2 = wanted_twist(seen, arrays.scales, settings.base)
+        memory = read_rejection(arrays.states, robot, lane)
+        u_1, u_2, memory = wanted_twist(seen, arrays.scales, settings.base, memory)
+        write_rejection(arrays.states, robot, lane, memory)
         share = residual_share(seen, arrays.scales, settings.residual_fade, settings.residual_reach)
         u_1 += share * a_0 * FULL_RESIDUAL_MM_S
         u_2 += share * a_1 * FULL_RESIDUAL_RAD_S
@@ -114,9 +118,11 @@ def take_actions(arrays: Arrays, lane: int, settings: Settings) -> None:
     for robot in range(arrays.actions.shape[1]):
         if arrays.kinds[robot, lane] == REFERENCE:
             given = arrays.twists[lane, robot]
-            given[0], given[1] = reference_action(
-                arrays.observations[lane, robot], arrays.scales, settings.base
+            memory = read_rejection(arrays.states, robot, lane)
+            given[0], given[1], memory = reference_action(
+                arrays.observations[lane, robot], arrays.scales, settings.base, memory
             )
+            write_rejection(arrays.states, robot, lane, memory)
             arrays.actions[lane, robot, 0], arrays.actions[lane, robot, 1] = given[0], given[1]
         a_0, a_1 = (
             clipped_action(arrays.actions[lane, robot, 0]),

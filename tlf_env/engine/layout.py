@@ -20,6 +20,7 @@ from tlf_env.numerics.rows import reader, row_reader, row_writer, writer
 from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.estimator import Ekf, Estimate
 from tlf_env.onboard.gyro_estimator import GyroEkf, GyroEstimate
+from tlf_env.onboard.rejection import RejectionState
 from tlf_env.onboard.slip_estimator import SlipEkf, SlipEstimate
 from tlf_env.onboard.speed_observer import SpeedObserverRow, SpeedObserverState
 from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState
@@ -220,6 +221,9 @@ ROWS = (
     Row("command", WheelPair, Kind.CONTROL),  # ``wanted``, or torques of a wheel loop outside
     Row("observer", Pose, Kind.CONTROL),
     Row("start", Pose, Kind.CONTROL),
+    Row(
+        "rejection", RejectionState, Kind.CONTROL
+    ),  # of the reference's law, or of a residual's base
     Row("effects", Effects, Kind.SCRATCH),  # copied from the channels' values
     Row("sample", Sample, Kind.SCRATCH),
     Row("order", Order, Kind.SCRATCH),

@@ -16,6 +16,7 @@ from tlf_env.common.presets import read_preset_or_file
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.trig import sincos
 from tlf_env.onboard.limiter import TwistLimits, TwistLimitsRow, twist_limits_row
+from tlf_env.onboard.rejection import Rejection, RejectionRow, rejection_row
 from tlf_env.onboard.spacing import Spacing, SpacingRow, spacing_row
 
 
@@ -55,10 +56,15 @@ class Gains(NamedTuple):
 
 
 class Linearisation(Frozen):
-    """Feedback linearisation of a point ``ahead_mm`` before the axle; its error decays with ``gain_per_s``."""
+    """Feedback linearisation of a point ``ahead_mm`` before the axle; its error decays with ``gain_per_s``.
+
+    ``rejection``: an observer of the motion that the wheels do not explain, which the law subtracts; it gives
+    the law a memory.
+    """
 
     ahead_mm: Positive
     gain_per_s: Positive
+    rejection: Rejection | None = None
 
 
 class Controller(Frozen):
@@ -88,6 +94,7 @@ class ControllerRow(NamedTuple):
     gains: Gains
     ahead: float  # mm, of the point of the feedback linearisation; 0: the paper's law
     decay: float  # 1/s, of its error
+    rejection: RejectionRow
     limits: TwistLimitsRow
     spacing: SpacingRow
     lead: float  # fraction of the time to the first preview
@@ -118,6 +125,7 @@ def controller_row(
         gains=gains_row(controller.gains),
         ahead=0.0 if point is None else point.ahead_mm,
         decay=0.0 if point is None else point.gain_per_s,
+        rejection=rejection_row(None if point is None else point.rejection, period_s),
         limits=twist_limits_row(controller.limits, period_s),
         spacing=spacing_row(controller.spacing),
         lead=lead,

@@ -11,6 +11,7 @@ from tlf_env.numerics.compiled import law
 from tlf_env.onboard.calibration import Belief, believed_wheel_speeds
 from tlf_env.onboard.limiter import braked, limited_twist, saturated
 from tlf_env.onboard.observer import Message
+from tlf_env.onboard.rejection import RejectionState, observed_rejection
 from tlf_env.onboard.spacing import Predecessor, spaced_twist
 from tlf_env.onboard.supervisor import SupervisorRow, curvature, supervised_twist
 from tlf_env.onboard.tracking import ControllerRow, linearised_twist, tracking_twist
@@ -65,6 +66,8 @@ SIN_E_3 = Tracking._fields.index("sin_e_3")
 COS_E_3 = Tracking._fields.index("cos_e_3")
 U_1 = Tracking._fields.index("reference_u_1")
 U_2 = Tracking._fields.index("reference_u_2")
+ODOMETRY_1 = Tracking._fields.index("odometry_u_1")
+ODOMETRY_2 = Tracking._fields.index("odometry_u_2")
 COMMAND_1 = Tracking._fields.index("command_u_1")
 COMMAND_2 = Tracking._fields.index("command_u_2")
 LATER_U_1 = len(Tracking._fields) + Preview._fields.index("u_1")
@@ -83,21 +86,41 @@ def clipped_action(component: float) -> float:
 
 @law
 def wanted_twist(
-    observation: np.ndarray, scales: np.ndarray, row: ControllerRow
-) -> tuple[float, float]:
-    """Twist (mm/s, rad/s) of the controller's tracking law from one ``tracking`` observation."""
-    u_1, u_2 = observation[U_1] * scales[U_1], observation[U_2] * scales[U_2]
+    observation: np.ndarray, scales: np.ndarray, row: ControllerRow, memory: RejectionState
+) -> tuple[float, float, RejectionState]:
+    """Twist (mm/s, rad/s) of the controller's law from one ``tracking`` observation, and its next memory."""
+    now_1, now_2 = observation[U_1] * scales[U_1], observation[U_2] * scales[U_2]
+    u_1, u_2 = now_1, now_2
     if row.lead > 0.0:
         u_1 += row.lead * (observation[LATER_U_1] * scales[LATER_U_1] - u_1)
         u_2 += row.lead * (observation[LATER_U_2] * scales[LATER_U_2] - u_2)
-    e_1 = saturated(
-        braked(observation[E_1] * scales[E_1], row.limits.braking_error), row.limits.forward_error
-    )
-    e_2 = saturated(observation[E_2] * scales[E_2], row.limits.lateral_error)
+    whole_1, whole_2 = observation[E_1] * scales[E_1], observation[E_2] * scales[E_2]
+    e_1 = saturated(braked(whole_1, row.limits.braking_error), row.limits.forward_error)
+    e_2 = saturated(whole_2, row.limits.lateral_error)
     sin, cos = observation[SIN_E_3] * scales[SIN_E_3], observation[COS_E_3] * scales[COS_E_3]
     if row.ahead > 0.0:
-        return linearised_twist(e_1, e_2, sin, cos, u_1, u_2, row.ahead, row.decay)
-    return tracking_twist(e_1, e_2, sin, cos, u_1, u_2, row.gains)
+        v_1, v_2 = linearised_twist(e_1, e_2, sin, cos, u_1, u_2, row.ahead, row.decay)
+        if row.rejection.at_once > 0.0:
+            cancelled = row.limits.slip  # what the limiter subtracts counts as motion by the wheels
+            memory = observed_rejection(
+                memory,
+                row.rejection,
+                row.ahead,
+                whole_1,
+                whole_2,
+                sin,
+                cos,
+                now_1,
+                now_2,
+                observation[ODOMETRY_1] * scales[ODOMETRY_1]
+                + cancelled * observation[SLIP_1] * scales[SLIP_1],
+                observation[ODOMETRY_2] * scales[ODOMETRY_2]
+                + cancelled * observation[SLIP_2] * scales[SLIP_2],
+            )
+            v_1, v_2 = v_1 - memory.d_1, v_2 - memory.d_2
+    else:
+        v_1, v_2 = tracking_twist(e_1, e_2, sin, cos, u_1, u_2, row.gains)
+    return v_1, v_2, memory
 
 
 @law
@@ -173,11 +196,12 @@ def twist_action(
 
 @law
 def reference_action(
-    observation: np.ndarray, scales: np.ndarray, row: ControllerRow
-) -> tuple[float, float]:
-    """The ``twist`` action of the reference controller from one ``tracking`` observation."""
-    u_1, u_2 = wanted_twist(observation, scales, row)
-    return twist_action(observation, scales, row, u_1, u_2)
+    observation: np.ndarray, scales: np.ndarray, row: ControllerRow, memory: RejectionState
+) -> tuple[float, float, RejectionState]:
+    """The ``twist`` action of the reference controller from one observation, and its next memory."""
+    u_1, u_2, memory = wanted_twist(observation, scales, row, memory)
+    a_0, a_1 = twist_action(observation, scales, row, u_1, u_2)
+    return a_0, a_1, memory
 
 
 @law

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from baselines.policies.memory import next_memory
 from tlf_env.common.models import Frozen, Positive
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.limiter import (
@@ -207,28 +208,19 @@ class Remembering(Law):
 
     @abstractmethod
     def step(
-        self, seen: dict[str, np.ndarray], memory: np.ndarray, fresh: np.ndarray
+        self, seen: dict[str, np.ndarray], memory: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Speed and yaw rate as for :meth:`Memoryless.twist`.
 
         Parameters
         ----------
         memory
-            ``(row, memory_size)``, to be changed in place.
-        fresh
-            True for the rows ``(row,)`` without a past, whose memory is 0.
+            ``(row, memory_size)``, to be changed in place; 0 in rows without a past.
         """
 
     def advance(
         self, seen: dict[str, np.ndarray], state: Any, episode_start: np.ndarray | None
     ) -> tuple[tuple[np.ndarray, np.ndarray], Any]:
         """The twist, and the next memory; the given one is not changed."""
-        shape = (len(seen["e_1"]), self.memory_size)
-        fresh = np.full(shape[0], state is None)
-        memory = np.zeros(shape) if state is None else np.array(state, dtype=np.float64)
-        if memory.shape != shape:
-            raise ValueError(f"the state must be of the shape {shape}, got {memory.shape}")
-        if episode_start is not None:
-            fresh |= np.asarray(episode_start, dtype=np.bool_)
-        memory[fresh] = 0.0
-        return self.step(seen, memory, fresh), memory
+        memory = next_memory(state, (len(seen["e_1"]), self.memory_size), episode_start)
+        return self.step(seen, memory), memory

@@ -144,7 +144,7 @@ class Predictive(Remembering):
         self._nodes = [f"{name}_in_{time_s:g}_s" for time_s in preview_s for name in NODE]
 
     def step(
-        self, seen: dict[str, np.ndarray], memory: np.ndarray, fresh: np.ndarray
+        self, seen: dict[str, np.ndarray], memory: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """The twist after a control period of the planned accelerations, row by row."""
         start = np.stack(
