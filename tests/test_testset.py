@@ -2,11 +2,14 @@
 
 import dataclasses
 import hashlib
+import importlib
 import json
 import math
+import sys
 
 import numpy as np
 import pytest
+from page_tables import DOCS
 
 pytest.importorskip("arch")
 pytest.importorskip("scipy")
@@ -299,3 +302,36 @@ def test_every_preset_is_in_one_split():
     named = [*training, *CHOOSING_DISTURBANCES, *TEST_DISTURBANCES]
     assert sorted(named) == sorted(preset_names("disturbance"))
     assert set(TEST_TASKS) <= set(preset_names("scenario"))
+
+
+def test_the_published_results_are_those_on_the_page():
+    pytest.importorskip("matplotlib")
+    sys.path.insert(0, str(DOCS / "figures"))
+    made = importlib.import_module("make_test_set")
+    board = json.loads((DOCS / "test-set" / "leaderboard.json").read_text("utf-8"))
+    assert (board["version"], board["published"], board["cases"]) == (
+        VERSION,
+        True,
+        [20_000, 20_200],
+    )
+    page = (DOCS / "test-set.md").read_text("utf-8")
+    assert f"<!-- results -->\n{made.results(board)}\n<!-- end of results -->" in page
+    looks = [look["date"][:10] for look in board["looks"]]
+    assert all(f"| {day} | 1 | 20000–20199 |" in page for day in looks)
+    pair = next(
+        one
+        for one in board["differences"]
+        if one["policy"].startswith("kanayama") and one["other"] == "reference:linearised"
+    )
+    low, high = pair["error_mm"]["interval"]
+    found = f"{pair['error_mm']['median']:.2f} mm [{low:.2f}, {high:.2f}]".replace("-", "−")
+    assert found in page
+    readme = (DOCS.parent / "README.md").read_text("utf-8")
+    held = {entry["policy"].partition("+")[0]: entry["held"]["count"] for entry in board["entries"]}
+    assert f"`kanayama:searched` holds {held['kanayama:searched']} and has the best score" in readme
+    assert f"the default holds {held['reference:linearised']} with" in readme
+    for name in ("adrc:searched", "residual", "reference:tuned", "reference:consistent"):
+        assert f"`{name}` {held[name]}" in readme
+    alone, other = pair["held"]["only"]
+    assert f"{alone} are held by it alone, {other} by the default" in page
+    assert (DOCS / "test-set" / "leaderboard.md").read_text("utf-8") == markdown(board)

@@ -3,16 +3,19 @@
 ``python docs/figures/make_test_set.py`` runs 60 cases with numbers from 10300 on, never the published ones, for
 60 s each with every system of the table. It takes about ten minutes on one core, needs the extras
 ``bench`` and ``figures``, and can be interrupted: the runs are kept in ``results/test_set_cases``.
-``--figure`` draws only the picture.
+``--figure`` draws only the picture. ``--published FOLDER`` takes over the results of ``tlf bench --test``
+instead: the table of results, and the files in ``docs/test-set``.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
-from make_board import DOCS
+from make_board import DOCS, write_text
 from make_parts import put
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle
@@ -20,7 +23,7 @@ from matplotlib.patches import Circle
 from baselines.benchmark.bench import run_bench
 from baselines.benchmark.lines import Line
 from baselines.benchmark.testset import NAME, case_scenario, drawn_case, severity_of
-from baselines.benchmark.testset_plan import TestPlan, fingerprint
+from baselines.benchmark.testset_plan import PUBLISHED, TestPlan, fingerprint
 from baselines.benchmark.testset_score import SEVERITIES, case_error_mm, geometric_mean
 from baselines.runs.outcome import failed
 from baselines.runs.seed_ranges import FIRST_TABLE_SEED
@@ -82,6 +85,41 @@ def table(lines: list[Line]) -> str:
     return "\n".join(parts)
 
 
+def take_over(folder: Path) -> None:
+    """Keep the leaderboard of a run of the published cases, and write the table.
+
+    Raises
+    ------
+    ValueError
+        for results of other cases.
+    """
+    board = json.loads((folder / "leaderboard.json").read_text("utf-8"))
+    if not board["published"] or board["cases"] != list(PUBLISHED):
+        raise ValueError(f"{folder} has other cases than the published ones")
+    kept = DOCS / "test-set"
+    kept.mkdir(exist_ok=True)
+    for name in ("leaderboard.json", "leaderboard.md"):
+        write_text(kept / name, (folder / name).read_text("utf-8"))
+    put(DOCS / "test-set.md", results(board), "results")
+
+
+def results(board: dict[str, Any]) -> str:
+    """A row for each entry: score, cases held, and the share held in each third of the severities."""
+    out = [
+        "| entry | score mm | held | easiest third | middle third | hardest third |",
+        "|---|---:|---:|---:|---:|---:|",
+    ]
+    for entry in board["entries"]:
+        low, high = entry["score"]["interval"]
+        name = f"`{entry['policy']}`" + (" (privileged)" if entry["privileged"] else "")
+        shares = " | ".join(f"{100 * one['share']:.0f} %" for one in entry["held_by_severity"])
+        score = f"{entry['score']['mm']:.1f} [{low:.1f}, {high:.1f}]"
+        out.append(
+            f"| {name} | {score} | {entry['held']['count']} of {entry['cases']} | {shares} |"
+        )
+    return "\n".join(out)
+
+
 def _shares(held: set[int], seeds: list[int]) -> str:
     cells = []
     for low, high in (*SEVERITIES, (0.0, 1.0)):
@@ -127,7 +165,11 @@ def main() -> None:
     parser.add_argument("--cases", type=int, default=60)
     parser.add_argument("--processes", type=int, default=1)
     parser.add_argument("--figure", action="store_true")
+    parser.add_argument("--published", type=Path, metavar="FOLDER")
     options = parser.parse_args()
+    if options.published is not None:
+        take_over(options.published)
+        return
     draw()
     if not options.figure:
         put(DOCS / "test-set.md", table(run_cases(options.cases, options.processes)), "cases")
