@@ -139,8 +139,8 @@ def test_the_best_of_a_column_fails_least_and_then_errs_least():
     cells = [
         cell("a", 0, 3.04),
         cell("b", 0, 3.01),
-        cell("c", 1, 0.5),
         cell("d", 50, 9.0),
+        cell("c", 1, 0.5),
         cell("e", 100, None),
     ]
     board = {

@@ -142,7 +142,7 @@ def shown(cell: dict[str, Any], best: tuple[int, float]) -> str:
 
 
 def readme_table(board: Board, task: str) -> str:
-    """The README's table of a task: policies by score, and selected disturbances."""
+    """The README's table of a task: policies by failed runs, then by score, and selected disturbances."""
     plan = board["plan"]["plan"]
     columns = [name for name in README_DISTURBANCES if name in plan["disturbances"]]
     columns = columns or plan["disturbances"][: len(README_DISTURBANCES)]
@@ -151,7 +151,10 @@ def readme_table(board: Board, task: str) -> str:
         for cell in board["cells"]
         if cell["task"] == task
     }
-    names = [row["policy"] for row in board["policies"]]
+    failed = {row["policy"]: 0 for row in board["policies"]}
+    for cell in board["cells"]:
+        failed[cell["policy"]] += failures(cell)
+    names = list(failed)
     best = {column: min(standing(cells[name, column]) for name in names) for column in columns}
     out = [
         f"| {TASK_NAMES.get(task, task)}, {load_scenario(task).robot_count} robots | "
@@ -159,11 +162,11 @@ def readme_table(board: Board, task: str) -> str:
         + " | failed, all | score, all |",
         "|---|" + "---:|" * (len(columns) + 2),
     ]
-    for row in board["policies"]:
+    for row in sorted(board["policies"], key=lambda one: failed[one["policy"]]):  # stable
         name = row["policy"]
         texts = [shown(cells[name, column], best[column]) for column in columns]
-        failed = sum(failures(cell) for cell in board["cells"] if cell["policy"] == name)
-        out.append(f"| `{name}` | {' | '.join(texts)} | {failed} | {row['score']['iqm']:.1f} |")
+        ends = f"{failed[name]} | {row['score']['iqm']:.1f}"
+        out.append(f"| `{name}` | {' | '.join(texts)} | {ends} |")
     return "\n".join(out)
 
 
@@ -180,7 +183,8 @@ def readme_part(board: Board) -> str:
         f"Position RMS of the worst robot in mm, median over {end - first} runs{length}. In brackets: the "
         "number of *failed* runs (a robot is lost or touches another); if at least half fail, only this "
         f"number is given. **Bold**: fewest failures, then smallest error. *All*: the {places} pairs of task "
-        f"and disturbance, {places * (end - first)} runs; the score is an interquartile mean from 0 to 100.\n\n"
+        f"and disturbance, {places * (end - first)} runs; the score is an interquartile mean from 0 to 100, which hides failures. "
+        "Rows: fewest failed runs first.\n\n"
         f"{tables}\n\n"
         "All disturbances, intervals, and the command that reproduces them: "
         "[docs/leaderboard.md](docs/leaderboard.md)."
