@@ -140,8 +140,8 @@ class ReferencePolicy:
         rows = np.ascontiguousarray(rows)
         action = np.empty((len(rows), ACTION_SIZE), dtype=rows.dtype)
         remembers = self._row.rejection.at_once > 0.0
-        given = (state, episode_start) if remembers else (None, None)
-        memory = next_memory(given[0], (len(rows), len(RejectionState._fields)), given[1])
+        shape = (len(rows), len(RejectionState._fields))
+        memory = next_memory(state, shape, episode_start) if remembers else np.zeros(shape)
         _actions(rows, self._scales, self._row, self._supervisor_row, memory.T, action)
         if remembers:
             state = memory
