@@ -42,7 +42,7 @@ def entry_rows(entries: dict[str, Entry], first: int = 0) -> list[tuple[str, ...
     ]
 
 
-LIMITED = """`action_range=(300.0, 3.0)` sets what 1.0 means in `tracking_twist` and `residual`, in mm/s and rad/s.
+LIMITED = """`action_range=(300.0, 3.0)` sets what 1.0 means in `tracking_twist` and `residual`, mm/s and rad/s.
 
 `limiter` puts a [limiter](systems.md#limiters) behind the actions `twist`, `wheel_speed` and `tracking_twist`:
 a preset, a file or a mapping. Motors and tyres can follow what it lets through. It is the law that limits a
