@@ -111,6 +111,7 @@ class FormationVecEnv(VecEnv):
             for field in (
                 "observation",
                 "action",
+                "action_range",
                 "preview_s",
                 "rays",
                 "neighbour",

@@ -31,7 +31,7 @@ pettingzoo_test = pytest.importorskip(
     "pettingzoo.test"
 )  # imports deprecated games: not a test of us
 
-ACTIONS = ("twist", "wheel_speed", "torque", "residual")
+ACTIONS = ("twist", "wheel_speed", "torque", "residual", "tracking_twist")
 OBSERVATIONS = ("tracking", "sensor")
 PLANTS = ("pymunk", "kinematic")
 KINDS = [

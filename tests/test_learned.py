@@ -16,6 +16,7 @@ from baselines.policies.card import read_policy, write_policy
 from baselines.policies.network import Network
 from baselines.policies.registry import fit_policy, make_policy, policy_hash
 from baselines.runs.run import run_policy
+from tlf_env.onboard.limiters import Limiter, load_limiter
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import load_scenario
 
@@ -400,6 +401,22 @@ def test_fade_and_reach_of_a_residual_belong_to_the_policy(tmp_path):
     assert overrides["residual_reach_mm"] == 90.0
     with pytest.raises(ValueError, match=r"residual_fade_mm 4.0, the scenario has 5.0"):
         make_policy(path, load_scenario(fading, residual_fade_mm=5.0))
+
+
+def test_range_and_limiter_of_an_action_belong_to_the_policy(tmp_path):
+    """Also the limiter that an action has where the scenario names none: what is usual may change."""
+    narrow = load_scenario(TWIST, action="tracking_twist", action_range=(60.0, 0.5))
+    path = str(written(tmp_path, scenario=narrow))
+    fitted = fit_policy(path, TWIST)
+    assert fitted.scenario.action_entries == narrow.action_entries
+    assert fitted.scenario.limiter == narrow.action_limiter == load_limiter("grip")
+    with pytest.raises(ValueError, match=r"action_scales \(60.0, 0.5\), the scenario has"):
+        make_policy(path, load_scenario(fitted.scenario, action_range=(60.0, 1.0)))
+    with pytest.raises(ValueError, match="it was trained with limiter"):
+        make_policy(path, load_scenario(fitted.scenario, limiter="body"))
+    free = str(written(tmp_path, scenario=load_scenario(narrow, limiter="none"), name="free"))
+    assert fit_policy(free, TWIST).scenario.action_limiter == Limiter()
+    assert "limiter" not in fit_policy(str(written(tmp_path, name="twist")), TWIST).overrides
 
 
 def test_a_policy_gets_the_fields_that_it_asks_for_if_they_are_not_set(tmp_path):

@@ -17,7 +17,6 @@ pytest.importorskip("optuna")
 
 from baselines.cli import main
 from baselines.policies.laws.catalogue import LAWS, read_law
-from baselines.policies.laws.law import BOUNDS
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.registry import fit_policy
 from baselines.runs.run import run_seeds
@@ -27,6 +26,7 @@ from baselines.tuning.search import RESULT_FILE, run_tune
 from baselines.tuning.study import SCORES, STUDY_FILE, StoredStudy
 from baselines.tuning.trial import Outcome, TrialJob, measured, run_trial
 from tlf_env.onboard.controllers import controller, load_controller
+from tlf_env.onboard.limiter import BOUNDS
 from tlf_env.task.scenario import load_scenario
 
 # A start of its own: the preset may change.

@@ -22,9 +22,10 @@ from baselines.policies.network import NORMALISATION, Network
 from tlf_env.common.errors import one_line
 from tlf_env.common.files import atomic, parse_json
 from tlf_env.common.models import Frozen, NonNegative, Positive, Whole
+from tlf_env.onboard.limiters import Limiter
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.supervisor import Neighbour
-from tlf_env.task.actions import ACTION_ENTRIES, ActionKind
+from tlf_env.task.actions import ActionKind
 from tlf_env.task.observation import SAMPLE_ENTRIES, sensor_entries, tracking_entries
 from tlf_env.task.scenario import Scenario
 
@@ -44,6 +45,7 @@ class Card(Frozen):
     # What it was trained with, and has to be run with.
     action: ActionKind
     action_scales: tuple[Positive, Positive]  # value of 1.0: mm/s, rad/s, N·mm
+    limiter: Limiter | None = None  # of the action's twist; None: it is not limited
     observation: Literal["tracking", "sensor"]
     entries: dict[str, Positive]  # that the policy takes, in its order, with their scales
     preview_s: tuple[NonNegative, ...]  # () for sensor, which has none
@@ -162,11 +164,12 @@ def _scales(
 
 def interface(scenario: Scenario) -> dict[str, Any]:
     """The fields of a card that a scenario determines."""
-    residual = scenario.action == "residual"
+    residual, limiter = scenario.action == "residual", scenario.action_limiter
     previews = scenario.preview_s if scenario.observation == "tracking" else ()
     return {
         "control_period_s": scenario.control_period_s,
         "action": scenario.action,
+        "limiter": None if limiter == Limiter() else limiter,
         "residual_base": scenario.residual_base if residual else None,
         "residual_fade_mm": scenario.residual_fade_mm if residual else 0.0,
         "residual_reach_mm": scenario.residual_reach_mm if residual else None,
@@ -179,7 +182,7 @@ def interface(scenario: Scenario) -> dict[str, Any]:
         "entries": _scales(
             scenario.observation, previews, scenario.substeps, scenario.rays, scenario.neighbour
         ),
-        "action_scales": tuple(entry.scale for entry in ACTION_ENTRIES[scenario.action]),
+        "action_scales": tuple(entry.scale for entry in scenario.action_entries),
     }
 
 

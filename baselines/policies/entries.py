@@ -17,10 +17,11 @@ from tlf_env.common.models import Frozen
 from tlf_env.common.presets import read_yaml
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS
+from tlf_env.onboard.limiters import Limiter
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.supervisor import Neighbour
-from tlf_env.task.actions import ACTION_ENTRIES, ActionKind
+from tlf_env.task.actions import ActionKind
 from tlf_env.task.observation import Entry, sensor_entries, tracking_entries
 from tlf_env.task.scenario import Scenario
 
@@ -33,6 +34,8 @@ class AskedFields(Frozen):
     """The scenario fields that a program may ask for; None: the scenario's."""
 
     action: ActionKind | None = None
+    action_range: tuple[float, float] | None = None
+    limiter: Limiter | None = None
     observation: Literal["tracking", "sensor"] | None = None
     estimator: str | None = None
     ekf_slip: SlipEkfParameters | None = None
@@ -215,7 +218,7 @@ def hello(scenario: Scenario) -> dict[str, Any]:
         ],
         "action": [
             {"meaning": entry.meaning, "unit": entry.unit, "scale": entry.scale}
-            for entry in ACTION_ENTRIES[scenario.action]
+            for entry in scenario.action_entries
         ],
         "dtype": "<f4" if scenario.dtype == "float32" else "<f8",
         "control_period_s": scenario.control_period_s,

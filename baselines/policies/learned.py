@@ -17,7 +17,8 @@ import numpy as np
 from baselines.policies.card import WEIGHTS, Loaded, read_policy
 from baselines.policies.columns import Columns
 from tlf_env.numerics.compiled import block, driver, law
-from tlf_env.task.actions import ACTION_SIZE
+from tlf_env.onboard.limiters import Limiter
+from tlf_env.task.actions import ACTION_ENTRIES, ACTION_SIZE, LIMITED_KINDS, RANGED_KINDS
 from tlf_env.task.scenario import Scenario
 
 SHIPPED = Path(__file__).resolve().parent / "weights"
@@ -113,6 +114,12 @@ class LearnedPolicy:
         asked["residual_reach_mm"] = card.residual_reach_mm
         if card.observation == "tracking":
             asked["preview_s"] = card.preview_s
+        if card.action in RANGED_KINDS and card.action_scales != tuple(
+            entry.scale for entry in ACTION_ENTRIES[card.action]
+        ):
+            asked["action_range"] = card.action_scales
+        if card.action in LIMITED_KINDS and (card.limiter or card.action == "tracking_twist"):
+            asked["limiter"] = (card.limiter or Limiter()).model_dump()
         asked["rays"] = None if card.rays is None else card.rays.model_dump()
         asked["neighbour"] = None if card.neighbour is None else card.neighbour.model_dump()
         self.scenario_overrides = {

@@ -35,6 +35,8 @@ from tlf_env.task.scenario import Scenario, load_scenario
 # The task and the disturbance are not among them: they are the same for all policies.
 OVERRIDABLE = (
     "action",
+    "action_range",
+    "limiter",
     "observation",
     "residual_base",
     "residual_fade_mm",

@@ -16,7 +16,7 @@ from pydantic import (
 
 from baselines.policies.laws.catalogue import LAWS
 from baselines.policies.reference import ReferencePolicy
-from baselines.policies.systems import Limiter, parse_system
+from baselines.policies.systems import parse_system
 from baselines.runs.nested import value_at, with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from baselines.runs.splits import check_training
@@ -26,6 +26,7 @@ from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch,
 from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
 from tlf_env.onboard.controllers import ControllerFile
 from tlf_env.onboard.kinds import EstimatorKind
+from tlf_env.onboard.limiters import Limiter
 from tlf_env.onboard.parts import Policy
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import Controller

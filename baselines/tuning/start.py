@@ -13,16 +13,13 @@ from baselines.policies.systems import (
     ESTIMATORS,
     PYTHON_ESTIMATORS,
     LimitedLaw,
-    Limiter,
     SystemName,
     asked_by,
-    behind,
-    load_limiter,
-    own_limiter,
     parse_system,
 )
 from tlf_env.common.errors import one_line
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller
+from tlf_env.onboard.limiters import Limiter, behind, load_limiter, own_limiter
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario
 

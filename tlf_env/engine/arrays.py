@@ -34,7 +34,7 @@ from tlf_env.onboard.speed_observer import speed_observer_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters, digital_wheel_loop
 from tlf_env.physics.vehicle import Floor, Push, body
 from tlf_env.physics.world import capsule_rows
-from tlf_env.task.actions import ACTION_KINDS, ACTION_SIZE
+from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.info import Info
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 from tlf_env.task.observation import sensor_entries, tracking_entries
@@ -290,7 +290,7 @@ def make_arrays(
         ),
         imposed=np.full((len(CHANNELS), robots, columns), np.nan),
         torques=np.zeros((2, dead + 1, robots, columns)),
-        kinds=np.full((robots, columns), ACTION_KINDS[scenario.action], dtype=np.int64),
+        kinds=np.full((robots, columns), scenario.action_kind, dtype=np.int64),
         inputs=zeros(PUSH_INPUT + len(Push._fields) if scenario.plant == "chipmunk" else 0),
         samples=np.zeros((scenario.substeps, len(Sample._fields), robots, columns)),
         fixes=np.zeros((len(Fix._fields), old + 1, robots, columns)),

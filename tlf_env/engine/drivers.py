@@ -48,18 +48,25 @@ from tlf_env.engine.substeps import trace_drive
 from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import block, driver, fetch_add, law
 from tlf_env.numerics.philox import unit, words
+from tlf_env.onboard.calibration import believed_odometry
 from tlf_env.onboard.kinds import TRUTH
 from tlf_env.onboard.observer import Message
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 from tlf_env.task.actions import (
-    FULL_RESIDUAL_MM_S,
-    FULL_RESIDUAL_RAD_S,
+    FULL_SPEED_MM_S,
     FULL_TORQUE_NMM,
+    FULL_YAW_RATE_RAD_S,
+    LIMITED_TWIST,
+    LIMITED_WHEEL_SPEED,
     REFERENCE,
     RESIDUAL,
     TORQUE,
+    TRACKING_TWIST,
     TWIST,
+    WHEEL_SPEED,
+    allowed_twist,
     clipped_action,
+    led_reference,
     reference_action,
     residual_share,
     twist_action,
@@ -91,11 +98,24 @@ def command(arrays: Arrays, lane: int, robot: int, settings: Settings) -> tuple[
         u_1, u_2, memory = wanted_twist(seen, arrays.scales, settings.base, memory)
         write_rejection(arrays.states, robot, lane, memory)
         share = residual_share(seen, arrays.scales, settings.residual_fade, settings.residual_reach)
-        u_1 += share * a_0 * FULL_RESIDUAL_MM_S
-        u_2 += share * a_1 * FULL_RESIDUAL_RAD_S
+        u_1 += share * a_0 * settings.full_1
+        u_2 += share * a_1 * settings.full_2
         given[0], given[1] = twist_action(seen, arrays.scales, settings.base, u_1, u_2)
         return wheel_command(given[0], given[1], TWIST, body, belief)
-    return wheel_command(a_0, a_1, kind, body, belief)
+    if kind not in (TRACKING_TWIST, LIMITED_TWIST, LIMITED_WHEEL_SPEED):
+        return wheel_command(a_0, a_1, kind, body, belief)
+    seen, given = arrays.observations[lane, robot], arrays.twists[lane, robot]
+    if kind == TRACKING_TWIST:
+        u_1, u_2 = led_reference(seen, arrays.scales, settings.limits.lead)
+        u_1, u_2 = u_1 + a_0 * settings.full_1, u_2 + a_1 * settings.full_2
+    elif kind == LIMITED_TWIST:
+        u_1, u_2 = a_0 * FULL_SPEED_MM_S, a_1 * FULL_YAW_RATE_RAD_S
+    else:
+        left, right = wheel_command(a_0, a_1, WHEEL_SPEED, body, belief)
+        u_1, u_2 = believed_odometry(left, right, body, belief)
+    u_1, u_2 = allowed_twist(seen, arrays.scales, settings.limits, settings.supervisor, u_1, u_2)
+    given[0], given[1] = twist_action(seen, arrays.scales, settings.limits, u_1, u_2)
+    return wheel_command(given[0], given[1], TWIST, body, belief)
 
 
 @block

@@ -28,7 +28,7 @@ from tlf_env.engine.layout import (
     YawRate,
     in_tile,
 )
-from tlf_env.engine.substeps import EXTERNAL_TORQUE, wanted
+from tlf_env.engine.substeps import wanted
 from tlf_env.numerics.compiled import law
 from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.numerics.rows import replacing
@@ -50,7 +50,7 @@ from tlf_env.onboard.slip_estimator import (
 )
 from tlf_env.onboard.tracking import body_errors
 from tlf_env.physics.vehicle import Body, Motion, axle_midpoint, forward_and_yaw, odometry
-from tlf_env.task.actions import TORQUE
+from tlf_env.task.actions import EXTERNAL_TORQUE, TORQUE
 
 
 def of_group(group: str) -> tuple[np.ndarray, np.ndarray]:

@@ -7,10 +7,13 @@ from typing import NamedTuple
 
 from tlf_env.disturbances.model import changes_within_episode
 from tlf_env.onboard.kinds import ESTIMATOR_CODES, EXTERNAL
+from tlf_env.onboard.limiters import behind
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.rays import Rays
-from tlf_env.onboard.tracking import ControllerRow, controller_row
+from tlf_env.onboard.supervisor import SupervisorRow, supervisor_row
+from tlf_env.onboard.tracking import Controller, ControllerRow, controller_row
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
+from tlf_env.task.observation import neighbour_place
 from tlf_env.task.scenario import Scenario
 
 
@@ -49,6 +52,12 @@ class Settings(NamedTuple):
     changing: bool  # whether a channel of every substep varies within an episode
     adversary: bool
     base: ControllerRow  # of the twist that a residual is added to
+    full_1: float  # what an action of 1.0 adds to a twist, mm/s and rad/s
+    full_2: float
+    limits: (
+        ControllerRow  # limits, distance and lead of the scenario's limiter; the law is not used
+    )
+    supervisor: SupervisorRow  # of that limiter
     residual_fade: float  # mm; 0 where a residual counts fully near the reference
     residual_reach: float  # mm; infinity where it does far from it
 
@@ -58,6 +67,8 @@ def make_settings(scenario: Scenario) -> Settings:
     observer = scenario.observer
     paper = observer if isinstance(observer, ObserverParameters) else ObserverParameters()
     rays = Rays() if scenario.rays is None else scenario.rays
+    full_1, full_2 = (entry.scale for entry in scenario.action_entries)
+    limiter = scenario.action_limiter
     return Settings(
         kinematic=scenario.plant == "kinematic",
         by_chipmunk=scenario.plant == "chipmunk",
@@ -90,6 +101,14 @@ def make_settings(scenario: Scenario) -> Settings:
         adversary=scenario.adversary,
         base=controller_row(
             scenario.base_controller, scenario.control_period_s, scenario.preview_s
+        ),
+        full_1=full_1,
+        full_2=full_2,
+        limits=controller_row(
+            behind(Controller(), limiter), scenario.control_period_s, scenario.preview_s
+        ),
+        supervisor=supervisor_row(
+            limiter.supervisor, neighbour_place(scenario.preview_s, scenario.neighbour)
         ),
         residual_fade=scenario.residual_fade_mm,
         residual_reach=scenario.residual_reach_mm or math.inf,

@@ -15,10 +15,7 @@ from tlf_env.numerics.rows import replacing
 from tlf_env.onboard.wheel_loop import WheelLoopRow, WheelLoopState, wheel_torque
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 from tlf_env.physics.vehicle import Body, Contact, Floor, Motion, Push, conveyor
-from tlf_env.task.actions import TORQUE
-
-# Replaces the kind of action of a robot whose wheel loop is an object in Python.
-EXTERNAL_TORQUE = 4
+from tlf_env.task.actions import EXTERNAL_TORQUE, TORQUE
 
 with_drive_sums = replacing(
     Trace, "torque_l", "torque_r", "saturated", "slip", "slid", "torque_2", "work"

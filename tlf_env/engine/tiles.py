@@ -65,7 +65,6 @@ from tlf_env.engine.sensors import (
 )
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.substeps import (
-    EXTERNAL_TORQUE,
     commanded_torques,
     floor_under,
     motor_torque,
@@ -81,7 +80,7 @@ from tlf_env.numerics.rows import replacing
 from tlf_env.onboard.kinds import EKF_GYRO
 from tlf_env.onboard.speed_observer import observed_speeds
 from tlf_env.physics.vehicle import Push, advance_pose, follow_wheels, roll, slide
-from tlf_env.task.actions import TORQUE
+from tlf_env.task.actions import EXTERNAL_TORQUE, TORQUE
 
 WIDTH = 8  # robots in a tile: doubles in the widest vectors there are
 # Places of the effects that pull at a robot, or limit its motors, and their values where they do not.

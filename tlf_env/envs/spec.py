@@ -42,8 +42,22 @@ def entry_rows(entries: dict[str, Entry], first: int = 0) -> list[tuple[str, ...
     ]
 
 
+LIMITED = """`action_range=(300.0, 3.0)` sets what 1.0 means in `tracking_twist` and `residual`, mm/s and rad/s.
+
+`limiter` puts a [limiter](systems.md#limiters) behind the actions `twist`, `wheel_speed` and `tracking_twist`:
+a preset, a file or a mapping. Motors and tyres can follow what it lets through. It is the law that limits a
+system `CONTROLLER+ESTIMATOR+LIMITER`: the twist that a law wants, as an action, gives the system's command. A
+limiter's `lead_s` shifts the reference that `tracking_twist` adds to; its supervisor needs a `neighbour`. By
+default `twist` and `wheel_speed` are not limited, and `tracking_twist` is, by the default system's `grip`;
+`limiter="none"` takes that away. A `residual` has the limits of its `residual_base`.
+
+```python
+env = tlf_env.parallel_env("infinity", action="tracking_twist", limiter="body")
+```"""
+
+
 def action_section() -> str:
-    """Section on the four kinds of action."""
+    """Section on the kinds of action."""
     rows = [
         (f"`{kind}`", str(i), entry.meaning, f"{entry.scale:g} {entry.unit}")
         for kind, entries in ACTION_ENTRIES.items()
@@ -51,7 +65,10 @@ def action_section() -> str:
     ]
     return (
         '`Box(−1, 1, (2,))`, float32 (float64 with `dtype="float64"`). Finite values outside are clipped '
-        "and counted.\n\n" + table(("action", "index", "meaning", "1.0 means"), rows)
+        "and counted.\n\n"
+        + table(("action", "index", "meaning", "1.0 means"), rows)
+        + "\n\n"
+        + LIMITED
     )
 
 

@@ -13,6 +13,9 @@ from typing import NamedTuple
 from tlf_env.common.models import Frozen, NonNegative, Positive, Switch, infinite_if_none
 from tlf_env.numerics.compiled import law
 
+# Fields that bound what a law sees, and so belong to a controller; the others limit what it may command.
+BOUNDS = ("braking_error_mm", "forward_error_mm", "lateral_error_mm")
+
 
 class TwistLimits(Frozen):
     """None: no such limit. Without any limit the law is that of the paper."""

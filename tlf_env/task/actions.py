@@ -1,4 +1,4 @@
-"""The four kinds of action, all in [−1, 1]², and their conversion to wheel speeds or torques."""
+"""The kinds of action, all in [−1, 1]², and their conversion to wheel speeds or torques."""
 
 from __future__ import annotations
 
@@ -19,15 +19,24 @@ from tlf_env.physics.vehicle import Body
 from tlf_env.task.observation import Entry, Preview, Tracking
 
 ACTION_SIZE = 2
-TWIST, WHEEL_SPEED, TORQUE, RESIDUAL = range(4)
-REFERENCE = 5  # the twist of the reference controller instead of an action
-ActionKind = Literal["twist", "wheel_speed", "torque", "residual"]
+TWIST, WHEEL_SPEED, TORQUE, RESIDUAL, TRACKING_TWIST = range(5)
+LIMITED_TWIST, LIMITED_WHEEL_SPEED = 5, 6  # behind the scenario's limiter
+REFERENCE = 7  # the twist of the reference controller instead of an action
+EXTERNAL_TORQUE = 8  # what a wheel loop in Python makes of any of them but TORQUE
+ActionKind = Literal["twist", "wheel_speed", "torque", "residual", "tracking_twist"]
 ACTION_KINDS: dict[ActionKind, int] = {
     "twist": TWIST,
     "wheel_speed": WHEEL_SPEED,
     "torque": TORQUE,
     "residual": RESIDUAL,
+    "tracking_twist": TRACKING_TWIST,
 }
+LIMITED_KINDS: dict[ActionKind, int] = {
+    "twist": LIMITED_TWIST,
+    "wheel_speed": LIMITED_WHEEL_SPEED,
+    "tracking_twist": TRACKING_TWIST,
+}
+RANGED_KINDS: tuple[ActionKind, ...] = ("residual", "tracking_twist")  # action_range is theirs
 
 FULL_SPEED_MM_S = 1000.0
 FULL_YAW_RATE_RAD_S = 8.0
@@ -35,6 +44,8 @@ FULL_WHEEL_SPEED_RAD_S = 25.0
 FULL_TORQUE_NMM = 15.0
 FULL_RESIDUAL_MM_S = 150.0
 FULL_RESIDUAL_RAD_S = 1.0
+FULL_TRACKING_MM_S = 300.0
+FULL_TRACKING_RAD_S = 3.0
 
 ACTION_ENTRIES = {
     "twist": (
@@ -58,6 +69,10 @@ ACTION_ENTRIES = {
         ),
         Entry("yaw rate added to that command", "rad/s", FULL_RESIDUAL_RAD_S),
     ),
+    "tracking_twist": (
+        Entry("forward speed added to the reference's u₁*", "mm/s", FULL_TRACKING_MM_S),
+        Entry("yaw rate added to the reference's u₂*", "rad/s", FULL_TRACKING_RAD_S),
+    ),
 }
 
 E_1 = Tracking._fields.index("e_1")
@@ -78,10 +93,32 @@ IS_LEADER = Tracking._fields.index("is_leader")
 PREDECESSOR = Tracking._fields.index("predecessor_forward")
 
 
+def action_entries(
+    kind: ActionKind, action_range: tuple[float, float] | None = None
+) -> tuple[Entry, ...]:
+    """Meaning, unit and scale of an action's components, with the scenario's ``action_range``, if any."""
+    entries = ACTION_ENTRIES[kind]
+    if action_range is None:
+        return entries
+    return tuple(
+        entry._replace(scale=full) for entry, full in zip(entries, action_range, strict=True)
+    )
+
+
 @law
 def clipped_action(component: float) -> float:
     """A component of an action, clipped to [−1, 1]."""
     return min(max(component, -1.0), 1.0)
+
+
+@law
+def led_reference(observation: np.ndarray, scales: np.ndarray, lead: float) -> tuple[float, float]:
+    """Twist (mm/s, rad/s) of the reference, ``lead`` of the way to that at the first preview."""
+    u_1, u_2 = observation[U_1] * scales[U_1], observation[U_2] * scales[U_2]
+    if lead > 0.0:
+        u_1 += lead * (observation[LATER_U_1] * scales[LATER_U_1] - u_1)
+        u_2 += lead * (observation[LATER_U_2] * scales[LATER_U_2] - u_2)
+    return u_1, u_2
 
 
 @law
@@ -90,10 +127,7 @@ def wanted_twist(
 ) -> tuple[float, float, RejectionState]:
     """Twist (mm/s, rad/s) of the controller's law from one ``tracking`` observation, and its next memory."""
     now_1, now_2 = observation[U_1] * scales[U_1], observation[U_2] * scales[U_2]
-    u_1, u_2 = now_1, now_2
-    if row.lead > 0.0:
-        u_1 += row.lead * (observation[LATER_U_1] * scales[LATER_U_1] - u_1)
-        u_2 += row.lead * (observation[LATER_U_2] * scales[LATER_U_2] - u_2)
+    u_1, u_2 = led_reference(observation, scales, row.lead)
     whole_1, whole_2 = observation[E_1] * scales[E_1], observation[E_2] * scales[E_2]
     e_1 = saturated(braked(whole_1, row.limits.braking_error), row.limits.forward_error)
     e_2 = saturated(whole_2, row.limits.lateral_error)

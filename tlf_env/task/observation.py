@@ -172,6 +172,11 @@ def tracking_entries(
     return TRACKING_ENTRIES | later | heard | ray_entries(rays)
 
 
+def neighbour_place(preview_s: tuple[float, ...], neighbour: Neighbour | None) -> int:
+    """Place of the neighbour's first entry in a ``tracking`` observation; −1 without a neighbour."""
+    return -1 if neighbour is None else len(tracking_entries(preview_s))
+
+
 @law
 def scaled(value: float, scale: float) -> float:
     """An entry in its scale, clipped at ±10."""

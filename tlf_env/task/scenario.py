@@ -35,16 +35,23 @@ from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for
 from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
+from tlf_env.onboard.limiters import DEFAULT_LIMITER, Limiter, load_limiter
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import PART_PATTERN
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.supervisor import Neighbour
-from tlf_env.onboard.tracking import Controller, controller_row
+from tlf_env.onboard.tracking import Controller, can_lead, controller_row
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.physics.world import World
-from tlf_env.task.actions import ActionKind
+from tlf_env.task.actions import (
+    ACTION_KINDS,
+    LIMITED_KINDS,
+    RANGED_KINDS,
+    ActionKind,
+    action_entries,
+)
 from tlf_env.task.feasibility import (
     disturbed,
     push_warnings,
@@ -53,6 +60,7 @@ from tlf_env.task.feasibility import (
     wall_warnings,
     warnings_for,
 )
+from tlf_env.task.observation import Entry
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
 from tlf_env.task.trajectories import Trajectory
 from tlf_env.task.waypoints import MAX_MAGNITUDE, scenario_of_waypoints
@@ -162,6 +170,11 @@ class Scenario(Frozen):
     adversary: Switch = False  # whether a caller may set disturbance channels at every step
 
     action: ActionKind = "twist"
+    # What 1.0 means in the actions `residual` and `tracking_twist`, mm/s and rad/s; None: 150 and 1, 300 and 3.
+    action_range: tuple[Positive, Positive] | None = None
+    # What the actions `twist`, `wheel_speed` and `tracking_twist` are limited by: a preset, a file or a
+    # mapping. None: the default's limiter for `tracking_twist`, no limits for the others.
+    limiter: Limiter | None = None
     # Base controller of the action `residual`, which is added to its twist: a preset or a file.
     residual_base: str = DEFAULT_CONTROLLER
     # Estimated errors at which a residual has half its weight: the weight decreases below the first and
@@ -211,6 +224,11 @@ class Scenario(Frozen):
     @classmethod
     def _disturbance_of_a_file(cls, value: Any) -> Any:
         return _named_disturbance(value) if isinstance(value, str | Path) else value
+
+    @field_validator("limiter", mode="before")
+    @classmethod
+    def _limiter_of_a_file(cls, value: Any) -> Any:
+        return load_limiter(value) if isinstance(value, str | Path) else value
 
     @field_validator("world", mode="before")
     @classmethod
@@ -296,6 +314,7 @@ class Scenario(Frozen):
                 f"most one control_period_s, {self.control_period_s}"
             )
         controller_row(self.base_controller, self.control_period_s, self.preview_s)
+        self._check_action()
         if self.plant == "kinematic" and (
             self.action == "torque" or isinstance(self.wheel_loop, str)
         ):
@@ -311,6 +330,26 @@ class Scenario(Frozen):
                 "plant 'chipmunk' has no tyres that creep; disturbance tyre.creep needs 'pymunk' or 'batch'"
             )
         return self
+
+    def _check_action(self) -> None:
+        """Check that the fields of an action belong to it, and what its limiter needs."""
+        if self.action_range is not None and self.action not in RANGED_KINDS:
+            raise ValueError(
+                f"action_range goes with the actions {' and '.join(RANGED_KINDS)}, not with {self.action!r}"
+            )
+        if self.limiter is None:
+            return
+        if self.action not in LIMITED_KINDS:
+            raise ValueError(
+                f"limiter goes with the actions {', '.join(LIMITED_KINDS)}, not with {self.action!r}"
+            )
+        if self.limiter.lead_s and not can_lead(self.preview_s):
+            raise ValueError(
+                f"limiter.lead_s {self.limiter.lead_s} needs a first preview above 0, got preview_s "
+                f"{self.preview_s}"
+            )
+        if self.limiter.supervisor is not None and self.neighbour is None:
+            raise ValueError("limiter.supervisor needs a neighbour; set neighbour, for example {}")
 
     def _check_contact(self) -> None:
         """Check that the world needs no pymunk space."""
@@ -431,6 +470,27 @@ class Scenario(Frozen):
     def base_controller(self) -> Controller:
         """The controller of ``residual_base``; the default goes without its lead where no preview is ahead."""
         return controller_for(self.residual_base, self.preview_s)
+
+    @property
+    def action_entries(self) -> tuple[Entry, ...]:
+        """Meaning, unit and scale of the components of an action."""
+        return action_entries(self.action, self.action_range)
+
+    @property
+    def action_limiter(self) -> Limiter:
+        """What an action's twist is limited by; without anything in it, if it is not."""
+        if self.limiter is not None:
+            return self.limiter
+        if self.action != "tracking_twist":
+            return Limiter()
+        usual = load_limiter(DEFAULT_LIMITER)
+        return usual if can_lead(self.preview_s) else usual.model_copy(update={"lead_s": 0.0})
+
+    @property
+    def action_kind(self) -> int:
+        """Code of the action in the compiled drivers."""
+        limited = self.limiter is not None and self.limiter != Limiter()
+        return (LIMITED_KINDS if limited else ACTION_KINDS)[self.action]
 
     @property
     def settle_s(self) -> float:
@@ -625,6 +685,11 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
         lines.append(
             f"residual_base {scenario.residual_base!r} subtracts the estimated slip from its commands, "
             "but estimator 'ekf' estimates none; use 'ekf-gyro' or 'ekf-slip'"
+        )
+    if scenario.estimator == "ekf" and scenario.action_limiter.limits.cancel_slip:
+        lines.append(
+            "the limiter subtracts the estimated slip from an action's twist, but estimator 'ekf' estimates "
+            "none; use 'ekf-gyro' or 'ekf-slip'"
         )
     return list(dict.fromkeys(lines))
 

@@ -13,7 +13,7 @@ from baselines.policies.laws.disturbance_rejection import (
     DisturbanceRejection,
     DisturbanceRejectionFile,
 )
-from baselines.policies.laws.law import BOUNDS, ErrorBounds, Law, LawFile
+from baselines.policies.laws.law import ErrorBounds, Law, LawFile
 from baselines.policies.laws.linear_quadratic import LinearQuadratic, LinearQuadraticFile
 from baselines.policies.laws.predictive import Predictive, PredictiveFile
 from baselines.policies.laws.sliding_mode import SlidingMode, SlidingModeFile
@@ -27,6 +27,7 @@ from baselines.policies.laws.textbook import (
 )
 from tlf_env.common.errors import one_line
 from tlf_env.common.presets import preset_names, preset_or_file, read_preset_or_file
+from tlf_env.onboard.limiter import BOUNDS
 from tlf_env.task.scenario import Scenario
 
 LAWS: dict[str, tuple[type[Law], type[LawFile]]] = {

@@ -36,7 +36,6 @@ class ErrorBounds(Frozen):
 
 
 UNBOUNDED = ErrorBounds()
-BOUNDS = tuple(ErrorBounds.model_fields)
 
 
 class LawFile(ErrorBounds):
