@@ -1,4 +1,4 @@
-"""The committed leaderboard, held against episodes run now."""
+"""The committed leaderboards, held against episodes run now."""
 
 import importlib
 import json
@@ -18,13 +18,22 @@ ROOT = Path(__file__).parent.parent / "docs" / "leaderboard"
 sys.path.insert(0, str(ROOT.parent / "figures"))
 make_board = importlib.import_module("make_board")
 
-LINES = [json.loads(line) for line in (ROOT / "slice.jsonl").read_text("utf-8").splitlines()]
-BOARD = json.loads((ROOT / "leaderboard.json").read_text("utf-8"))
+PAGES = list(make_board.BOARDS.values())
+LINES, BOARDS = {}, {}
+for name in PAGES:
+    texts = (ROOT.parent / name / "slice.jsonl").read_text("utf-8").splitlines()
+    LINES[name] = [json.loads(line) for line in texts]
+    BOARDS[name] = json.loads((ROOT.parent / name / "leaderboard.json").read_text("utf-8"))
+BOARD = BOARDS["leaderboard"]
 
 
-@pytest.mark.parametrize("line", LINES, ids=lambda line: f"{line['policy']} {line['disturbance']}")
-def test_a_slice_of_the_table_comes_out_again(line):
-    again = run_episode(make_board.plan_of(BOARD), Episode.of_line(line))
+@pytest.mark.parametrize(
+    ("name", "line"),
+    [(name, line) for name in PAGES for line in LINES[name]],
+    ids=lambda one: f"{one['policy']} {one['disturbance']}" if isinstance(one, dict) else one,
+)
+def test_a_slice_of_the_table_comes_out_again(name, line):
+    again = run_episode(make_board.plan_of(BOARDS[name]), Episode.of_line(line))
     assert again["scenario_hash"] == line["scenario_hash"]
     assert list(again) == list(line)
     fails = [any(robot["lost"] for robot in run["robots"]) for run in (again, line)]
@@ -37,14 +46,16 @@ def test_a_slice_of_the_table_comes_out_again(line):
             assert now[metric] == pytest.approx(then[metric], rel=0.01)
 
 
-def test_the_slice_is_of_the_board():
-    cells = {(cell["policy"], cell["task"], cell["disturbance"]) for cell in BOARD["cells"]}
-    assert {(line["policy"], line["task"], line["disturbance"]) for line in LINES} <= cells
+@pytest.mark.parametrize("name", PAGES)
+def test_the_slice_is_of_the_board(name):
+    cells = {(cell["policy"], cell["task"], cell["disturbance"]) for cell in BOARDS[name]["cells"]}
+    assert {(line["policy"], line["task"], line["disturbance"]) for line in LINES[name]} <= cells
 
 
-def test_the_slice_has_every_policy_and_task_and_as_many_disturbances_as_fit():
-    plan = make_board.plan_of(BOARD)
-    found = {name: {line[name] for line in LINES} for name in ("policy", "task", "disturbance")}
+@pytest.mark.parametrize("name", PAGES)
+def test_the_slice_has_every_policy_and_task_and_as_many_disturbances_as_fit(name):
+    plan, keys = make_board.plan_of(BOARDS[name]), ("policy", "task", "disturbance")
+    found = {key: {line[key] for line in LINES[name]} for key in keys}
     assert found["policy"] == set(plan.policies)
     assert found["task"] == {task for task, _ in plan.places}
     wanted = {disturbance for _, disturbance in plan.places}
@@ -57,9 +68,10 @@ def test_the_pages_are_those_of_the_board():
     root = ROOT.parent.parent
     readme = (root / "README.md").read_text("utf-8")
     assert make_board.with_part(readme, make_board.readme_part(BOARD)) == readme
-    figures = [f"leaderboard/{name}.png" for name in ("scores", "failures", "profiles")]
-    assert markdown(BOARD, figures) == (ROOT.parent / "leaderboard.md").read_text("utf-8")
-    assert all((ROOT.parent / name).is_file() for name in figures)
+    for page, board in BOARDS.items():
+        figures = [f"{page}/{name}.png" for name in ("scores", "failures", "profiles")]
+        assert markdown(board, figures) == (ROOT.parent / f"{page}.md").read_text("utf-8")
+        assert all((ROOT.parent / name).is_file() for name in figures)
 
 
 def test_the_verdicts_of_the_readme_are_those_of_the_board():
