@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import secrets
+import time
+from collections import deque
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
@@ -15,13 +17,14 @@ from tlf_env.engine.batch import BatchPlant, Source, checked_count
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.info import InfoChoice, chosen_keys
+from tlf_env.task.info import EndReason, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.start import Start, joined, same_start, start_options
 
 # A dictionary for each robot in each step: with all 50 keys they cost nearly as much as the simulation.
 CHEAP_INFOS = ("position_error_mm", "lost", "touched", "end")
 ATTRIBUTES = ("scenario", "place", "render_mode")
+ENDS_KEPT = 100  # episodes of a robot whose ends are counted, as many as SB3 averages
 
 
 class Place(NamedTuple):
@@ -55,7 +58,9 @@ class FormationVecEnv(VecEnv):
         Formation k gets ``seed`` + k in the first ``reset``; random if None.
     infos
         The keys of the infos that steps and ``reset_infos`` contain, True for all, False for none. The
-        last step of an episode also contains ``terminal_observation`` and ``TimeLimit.truncated``.
+        last step of an episode also contains ``terminal_observation``, ``TimeLimit.truncated`` and
+        ``episode``: its return ``r``, its length ``l`` and the time ``t`` (s) since the environment was
+        made, which SB3 averages as ``ep_rew_mean`` and ``ep_len_mean``.
     **overrides
         Fields of the scenarios, and ``disturbance_level``.
 
@@ -104,6 +109,27 @@ class FormationVecEnv(VecEnv):
             gymnasium.spaces.Box(-1.0, 1.0, (ACTION_SIZE,), dtype.type),
         )
         self._seed: int | None = None if seed is None else self._checked_seed(seed)
+        self._made_at_s = time.monotonic()
+        self._returns = np.zeros(self.num_envs)
+        self._lengths = np.zeros(self.num_envs, dtype=np.int64)
+        self._last_ends: deque[int] = deque(maxlen=ENDS_KEPT)
+
+    def clear_statistics(self) -> None:
+        """Count the running episodes from now on, and forget how others ended."""
+        self._returns[:], self._lengths[:] = 0.0, 0
+        self._last_ends.clear()
+
+    def end_shares(self) -> dict[str, float]:
+        """How the last 100 episodes of robots ended: the share of each :class:`~tlf_env.EndReason`.
+
+        All are 0 before the first end.
+        """
+        ended = max(len(self._last_ends), 1)
+        return {
+            reason.name.lower(): self._last_ends.count(reason) / ended
+            for reason in EndReason
+            if reason is not EndReason.RUNNING
+        }
 
     def _spaces_agree(self) -> None:
         first = self.plants[0].scenario
@@ -202,6 +228,7 @@ class FormationVecEnv(VecEnv):
                 None if self._seed is None else self._seed + int(first), options=joined(given)
             )
         self._seed, self._starts = None, []
+        self._returns[:], self._lengths[:] = 0.0, 0
         self._reset_seeds()
         self._reset_options()
         self.reset_infos = self._infos()
@@ -247,13 +274,24 @@ class FormationVecEnv(VecEnv):
             plant.step(rows.reshape(plant.arrays.actions.shape))
         rewards = np.concatenate([plant.rewards.ravel() for plant in self.plants])
         infos = self._infos()
-        dones = np.concatenate([(plant.ends != 0).ravel() for plant in self.plants])
+        ends = np.concatenate([plant.ends.ravel() for plant in self.plants])
+        dones = ends != EndReason.RUNNING
+        self._returns += rewards
+        self._lengths += 1
         if dones.any():
             last = self.observations()
             truncated = np.concatenate([plant.truncated.ravel() for plant in self.plants])
+            time_s = round(time.monotonic() - self._made_at_s, 6)
             for i in np.flatnonzero(dones):
                 infos[i]["terminal_observation"] = last[i]
                 infos[i]["TimeLimit.truncated"] = bool(truncated[i])
+                infos[i]["episode"] = {
+                    "r": float(self._returns[i]),
+                    "l": int(self._lengths[i]),
+                    "t": time_s,
+                }
+            self._last_ends.extend(ends[dones].tolist())
+            self._returns[dones], self._lengths[dones] = 0.0, 0
             for plant in self.plants:
                 plant.reset_finished()
         return self.observations(), rewards.astype(np.float32), dones, infos

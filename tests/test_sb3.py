@@ -113,13 +113,49 @@ def test_infos_have_the_same_keys_in_every_step(infos):
     env.reset()
     assert {frozenset(info) for info in env.reset_infos} == {frozenset(wanted)}
     ended = 0
-    last = {"terminal_observation", "TimeLimit.truncated"}
+    last = {"terminal_observation", "TimeLimit.truncated", "episode"}
     for action in actions(6, 150):
         _, _, dones, found = env.step(action)
         ended += dones.sum()
         for done, info in zip(dones, found, strict=True):
             assert set(info) == (wanted | last if done else wanted)
     assert ended > 5
+
+
+def test_an_episode_has_its_return_and_length_and_its_end_is_counted():
+    """As a monitor sums them, and the shares are those of the last 100 episodes."""
+    plain, watched = environment(2), VecMonitor(environment(2))
+    assert set(plain.end_shares().values()) == {0.0}
+    for env in (plain, watched):
+        env.seed(0)
+        env.reset()
+    ends = []
+    for action in actions(6, 150):
+        infos = plain.step(action)[3]
+        monitored = watched.step(action)[3]
+        for info, other in zip(infos, monitored, strict=True):
+            assert ("episode" in info) == ("episode" in other)
+            if "episode" in info:
+                assert info["episode"]["l"] == other["episode"]["l"]
+                assert info["episode"]["r"] == pytest.approx(other["episode"]["r"], abs=1e-4)
+                ends.append(info["end"])
+    assert len(ends) > 5
+    shares = plain.end_shares()
+    for reason in EndReason:
+        if reason is not EndReason.RUNNING:
+            kept = ends[-100:]
+            assert shares[reason.name.lower()] == pytest.approx(kept.count(reason) / len(kept))
+    assert sum(shares.values()) == pytest.approx(1.0)
+    plain.reset()
+    infos = plain.step(np.zeros((6, 2)))[3]
+    assert not any("episode" in info for info in infos)
+
+
+def test_learning_prints_the_mean_return_without_a_monitor():
+    model = PPO("MlpPolicy", environment(), seed=0, **SMALL)
+    model.learn(800)
+    assert len(model.ep_info_buffer) > 0
+    assert all(0 < one["l"] <= 100 for one in model.ep_info_buffer)
 
 
 def test_the_monitor_logs_how_an_episode_ended():

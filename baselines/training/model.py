@@ -109,6 +109,7 @@ def spread_out(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
         for plant, moments in zip(envs.plants, begin, strict=True):
             if (moments == step).any():
                 plant.reset(mask=moments == step)
+    envs.clear_statistics()
     model._last_obs = envs.observations()
     model._last_episode_starts = np.ones(envs.num_envs, dtype=np.bool_)
 

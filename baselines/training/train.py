@@ -149,6 +149,8 @@ def record_rollout(model: Any, done: TrainingProgress) -> None:
             }
         )
         model.logger.record("rollout/mean_reward", done.rollouts[-1]["mean_reward"])
+    for reason, share in model.get_env().end_shares().items():
+        model.logger.record(f"ends/{reason}", share)
     model.logger.dump(model.num_timesteps)
 
 
