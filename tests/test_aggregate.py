@@ -158,6 +158,19 @@ def test_a_run_counts_at_its_worst_robot_and_scores_the_mean():
     assert of_lines.run_score(run) == 20
 
 
+@pytest.mark.parametrize(
+    ("policies", "wanted"),
+    [
+        (["reference:printed+ekf+none", "reference:consistent+ekf+none"], 1),
+        (["reference:consistent", "reference:linearised+ekf"], 1),
+        (["kanayama", "lqr"], 0),
+        ([], None),
+    ],
+)
+def test_the_reference_may_be_in_a_system(policies, wanted):
+    assert aggregate.reference_of(policies) == (None if wanted is None else policies[wanted])
+
+
 def test_scores_are_normalised_by_the_reference_whatever_the_order(tmp_path):
     lines = [
         line(policy, seed, score=score)

@@ -41,9 +41,19 @@ from tlf_env.disturbances.channels import CHANNELS
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 
 PROFILE_SCORES = np.linspace(0, 100, 101)
-# What the others are compared with: the default controller by both its names, or else the paper's.
+# What the others are compared with: the default controller by both its names, or else the paper's, alone or in
+# the first system with it.
 REFERENCES = (f"reference:{DEFAULT_CONTROLLER}", "reference", "reference:consistent")
 LOSSES = (0.05, 0.5)
+
+
+def reference_of(policies: Sequence[str]) -> str | None:
+    """What the others are compared with: the first of :data:`REFERENCES`, or else the first policy."""
+    for name in REFERENCES:
+        for policy in policies:
+            if policy == name or policy.startswith(f"{name}+"):
+                return policy
+    return next(iter(policies), None)
 
 
 def leaderboard(results: Results, command: str = "") -> dict[str, Any]:
@@ -62,7 +72,7 @@ def leaderboard(results: Results, command: str = "") -> dict[str, Any]:
     groups: dict[str, Strata] = {}
     for line in results.ordered():
         groups.setdefault(line["policy"], {}).setdefault(stratum_of(line), []).append(line)
-    reference = next((name for name in (*REFERENCES, *groups) if name in groups), None)
+    reference = reference_of(list(groups))
     cells = [
         {
             "policy": policy,
