@@ -36,7 +36,6 @@ POLICIES = (
     "reference:consistent",
     "reference:tuned",
     "reference:linearised",  # the default
-    "kanayama:searched+ekf-gyro-smoothed+grip",
     "adrc:searched+ekf-gyro-smoothed+grip",
 )
 FOLDER = DOCS / "envelopes"
@@ -280,7 +279,7 @@ def names(text: str) -> tuple[str, ...]:
 def main() -> None:
     """Drive and write."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=100, help="of each level of the envelopes")
+    parser.add_argument("--seeds", type=int, default=20, help="of each level of the envelopes")
     parser.add_argument("--curve-seeds", type=int, default=4, help="of each point of the curves")
     parser.add_argument("--policies", type=names, default=POLICIES)
     parser.add_argument(
