@@ -534,7 +534,9 @@ def bench_test(
 def train(
     config: Annotated[
         str,
-        typer.Argument(help="Training: residual, direct, quick, sac, recurrent, or a YAML file."),
+        typer.Argument(
+            help="Training: scratch, residual, direct, quick, sac, recurrent, or a YAML file."
+        ),
     ],
     seeds: Annotated[str, typer.Option(help="Training seeds, comma-separated.")] = "0",
     robot_steps: Annotated[

@@ -333,3 +333,15 @@ class TestTraining:
         for folder in (tmp_path / "out", tmp_path / "alone"):
             policy = (folder / "policy.safetensors").read_bytes()
             assert policy == (folder / f"seed_{best}" / "policy.safetensors").read_bytes()
+
+    @pytest.mark.slow
+    def test_from_nothing_it_learns_to_follow(self, tmp_path):
+        """Before, every run is lost. It takes a minute and a half."""
+        from baselines.training.train import train
+
+        config = load_config("scratch", robot_steps=1_200_000)
+        curve = train(config, 0, tmp_path)
+        first, last = curve["evaluations"][0], curve["evaluations"][-1]
+        assert first["cells"]["infinity, nominal"]["failed"] == 10
+        assert last["cells"]["infinity, nominal"]["failed"] == 0
+        assert last["cells"]["infinity, nominal"]["position_rmse_mm"] < 100.0

@@ -54,9 +54,7 @@ class Settings(NamedTuple):
     base: ControllerRow  # of the twist that a residual is added to
     full_1: float  # what an action of 1.0 adds to a twist, mm/s and rad/s
     full_2: float
-    limits: (
-        ControllerRow  # limits, distance and lead of the scenario's limiter; the law is not used
-    )
+    limits: ControllerRow  # of the scenario's limiter, with no law in use
     supervisor: SupervisorRow  # of that limiter
     residual_fade: float  # mm; 0 where a residual counts fully near the reference
     residual_reach: float  # mm; infinity where it does far from it
