@@ -38,6 +38,12 @@ POLICIES = (
     "reference:linearised",  # the default
     "adrc:searched+ekf-gyro-smoothed+grip",
 )
+CURVE_POLICIES = (
+    *POLICIES[:3],
+    "kanayama:searched+ekf-gyro-smoothed+grip",
+    *POLICIES[3:],
+)
+ROW_SEEDS = 4
 FOLDER = DOCS / "envelopes"
 HORIZON_S, ROW_HORIZON_S = 60.0, 240.0
 SMOOTH = (("start_ramp_s", 6.0),)
@@ -58,8 +64,8 @@ class Curves:
     """Runs the sweeps of this page, each into a folder of its own, and draws with one style for each system."""
 
     def __init__(self, options: argparse.Namespace) -> None:
-        self.policies: tuple[str, ...] = options.policies
-        self.seeds = (FIRST_TABLE_SEED, FIRST_TABLE_SEED + options.curve_seeds)
+        self.policies: tuple[str, ...] = options.policies or CURVE_POLICIES
+        self.seeds: int = options.curve_seeds
         self._out, self._processes = options.out, options.processes
 
     def lines(
@@ -70,6 +76,7 @@ class Curves:
         *,
         task: str = "infinity",
         overrides: tuple[tuple[str, Any], ...] = (),
+        seeds: int | None = None,
     ) -> list[Line]:
         """The finished runs of a sweep."""
         path, values = parse_sweep(sweep)
@@ -77,7 +84,7 @@ class Curves:
             self.policies,
             (task,),
             tuple(disturbances),
-            self.seeds,
+            (FIRST_TABLE_SEED, FIRST_TABLE_SEED + (seeds or self.seeds)),
             sweep=path,
             sweep_values=values,
             overrides=(("horizon_s", HORIZON_S), ("plant", "batch"), *overrides),
@@ -206,6 +213,7 @@ def rows_figure(curves: Curves) -> None:
         ROW_DISTURBANCES,
         task="long_circle",
         overrides=(("horizon_s", ROW_HORIZON_S),),
+        seeds=ROW_SEEDS,
     )
     figure = Figure(figsize=(9.6, 7.4), layout="constrained")
     grid = figure.subplots(len(ROW_DISTURBANCES), 2, sharex="col")
@@ -237,7 +245,7 @@ def rows_figure(curves: Curves) -> None:
 def envelopes(options: argparse.Namespace) -> None:
     """The tables and the figure of the envelopes."""
     plan = EnvelopePlan(
-        options.policies,
+        options.policies or POLICIES,
         ("infinity",),
         options.knobs,
         (FIRST_TABLE_SEED, FIRST_TABLE_SEED + options.seeds),
@@ -280,8 +288,8 @@ def main() -> None:
     """Drive and write."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--seeds", type=int, default=20, help="of each level of the envelopes")
-    parser.add_argument("--curve-seeds", type=int, default=4, help="of each point of the curves")
-    parser.add_argument("--policies", type=names, default=POLICIES)
+    parser.add_argument("--curve-seeds", type=int, default=20, help="of the curves, but for rows")
+    parser.add_argument("--policies", type=names, help="in place of those of each part")
     parser.add_argument(
         "--knobs", type=names, default=tuple(knob_presets()), help="comma-separated"
     )
