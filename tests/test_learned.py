@@ -493,7 +493,9 @@ def test_a_custom_policy_may_ask_for_fields():
     assert (fitted.scenario.observation, fitted.scenario.action) == ("sensor", "residual")
     assert fitted.overrides["preview_s"] == []
     assert fit_policy("asking:Sensing", load_scenario(action="twist")).scenario.action == "twist"
-    with pytest.raises(ValueError, match="must map fields of action, observation"):
+    with pytest.raises(
+        ValueError, match="must map fields of action, action_range, limiter, observation"
+    ):
         fit_policy("asking:Greedy", TWIST)
     with pytest.raises(
         ValueError, match="policy 'asking:Odd' asks for an invalid scenario: action: "
