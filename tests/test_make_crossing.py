@@ -41,7 +41,7 @@ def test_the_cells_are_those_of_the_plan():
     }
     assert {(cell["policy"], cell["disturbance"]) for cell in CELLS} == wanted
     for cell in CELLS:
-        assert cell["runs"] >= (16 if cell["policy"].startswith("nmpc") else 50)
+        assert cell["runs"] >= (16 if cell["policy"].startswith("nmpc") else 100)
 
 
 @pytest.mark.parametrize("line", LINES, ids=lambda line: f"{line['policy']} {line['disturbance']}")
