@@ -19,6 +19,7 @@ from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.info import EndReason, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
+from tlf_env.task.scenario import learners_action
 from tlf_env.task.start import Start, joined, same_start, start_options
 
 # A dictionary for each robot in each step: with all 50 keys they cost nearly as much as the simulation.
@@ -52,6 +53,9 @@ class FormationVecEnv(VecEnv):
         Number of formations in all.
     mixture
         Whether every episode draws its scenario from those of its task; a sequence gives their shares.
+    staggered
+        Whether the first episodes end at different times, each task's formations spread over its horizon;
+        as in :class:`~tlf_env.engine.batch.BatchPlant`.
     threads
         Number of threads for a step; None: one per core.
     seed
@@ -62,7 +66,8 @@ class FormationVecEnv(VecEnv):
         ``episode``: its return ``r``, its length ``l`` and the time ``t`` (s) since the environment was
         made, which SB3 averages as ``ep_rew_mean`` and ``ep_len_mean``.
     **overrides
-        Fields of the scenarios, and ``disturbance_level``.
+        Fields of the scenarios, and ``disturbance_level``. ``action`` is by default that of
+        :class:`~tlf_env.envs.single.FormationEnv`.
 
     Raises
     ------
@@ -78,6 +83,7 @@ class FormationVecEnv(VecEnv):
         formations: int = 256,
         *,
         mixture: bool | Sequence[float] = False,
+        staggered: bool = False,
         threads: int | None = 1,
         seed: int | None = None,
         infos: InfoChoice = CHEAP_INFOS,
@@ -92,7 +98,14 @@ class FormationVecEnv(VecEnv):
             )
         shares = [len(part) for part in np.array_split(np.arange(formations), len(tasks))]
         self.plants = [
-            BatchPlant(task, share, threads=threads, mixture=mixture, **overrides)
+            BatchPlant(
+                task,
+                share,
+                threads=threads,
+                mixture=mixture,
+                staggered=staggered,
+                **learners_action(task, overrides),
+            )
             for task, share in zip(tasks, shares, strict=True)
         ]
         self._spaces_agree()

@@ -23,7 +23,7 @@ from tlf_env.task.info import INFO_KEYS
 
 LEARNER = 1
 SEED = 5
-SHORT = {"horizon_s": 3.0, "time_gap_s": 0.5, "preview_s": (0.2,)}
+SHORT = {"horizon_s": 3.0, "time_gap_s": 0.5, "preview_s": (0.2,), "action": "twist"}
 POSES = [[0.0, 0.0, 0.1], [0.0, -300.0, 0.0], [50.0, -650.0, -0.2]]
 
 
@@ -40,6 +40,7 @@ CASES = {
     "lost": Case({"lost_beyond_mm": 120.0, "disturbance": "slip"}),
     "going on when lost": Case({"lost_beyond_mm": 60.0, "end_on": ()}),
     "sensors": Case({"observation": "sensor", "dtype": "float64"}),
+    "about the reference": Case({"action": "tracking_twist", "limiter": "body"}),
     "torques": Case({"action": "torque", "cooperative": True}),
     "kinematic": Case({"plant": "kinematic", "reward": {"fine": 2.0}}),
     "phase": Case({"disturbance": "noise"}, {"phase_s": 7.3}),
@@ -176,7 +177,7 @@ def test_the_turn_based_form(case):
 
 def test_the_gymnasium_environment(case):
     case, episode = case
-    if case.fields.get("action") == "torque" or case.fields.get("observation") == "sensor":
+    if case.fields.get("action", "twist") != "twist" or case.fields.get("observation") == "sensor":
         pytest.skip("a policy drives the other robots by twists, from `tracking`")
     others = Replay(episode.actions, [0, 2])
     env = gymnasium.make(
@@ -196,7 +197,7 @@ def test_the_vector_environment(case, mode):
     """Sub-environment 2 of 4 has the seed of the episode; the reference drives the other robots."""
     case, episode = case
     fields = SHORT | case.fields
-    if fields.get("action") or fields.get("observation") or case is CASES["touching"]:
+    if fields["action"] != "twist" or fields.get("observation") or case is CASES["touching"]:
         pytest.skip("the reference drives the others by twists, from `tracking`")
     episode = without_contact(episode)
     env = gymnasium.make_vec(
@@ -265,12 +266,18 @@ def test_the_vector_environment_of_stable_baselines3(case):
     mine = slice(3, 6)
     seen = env.reset()
     same_step(Step(seen[mine], env.reset_infos[mine]), episode.steps[0])
-    for step, actions in zip(episode.steps[1:], episode.actions, strict=True):
+    returns = np.zeros(3)
+    for number, (step, actions) in enumerate(
+        zip(episode.steps[1:], episode.actions, strict=True), start=1
+    ):
         seen, rewards, dones, infos = env.step(np.concatenate([actions, actions]))
+        returns += step.rewards
         last, cut = seen[mine].copy(), np.zeros(3, dtype=np.bool_)
         for i, info in enumerate(infos[mine]):
             if dones[3 + i]:
                 last[i], cut[i] = info.pop("terminal_observation"), info.pop("TimeLimit.truncated")
+                statistics = info.pop("episode")
+                assert (statistics["r"], statistics["l"]) == (pytest.approx(returns[i]), number)
         assert rewards.dtype == np.float32
         wanted = step._replace(rewards=step.rewards.astype(np.float32))
         same_step(Step(last, infos[mine], rewards[mine], dones[mine] & ~cut, cut), wanted)

@@ -347,6 +347,7 @@ def test_the_reference_among_others_is_the_reference_policy_bitwise(
     learner: str, options: dict[str, Any]
 ) -> None:
     policy = ReferencePolicy(options.get("residual_base", "linearised"))
+    options = {"action": "twist", **options}
     alone = FormationEnv("infinity", learner=learner, others="reference", **options)
     together = tlf_env.parallel_env("infinity", **options)
     seen, info = alone.reset(seed=2)

@@ -66,7 +66,7 @@ def test_the_range_is_what_one_means(range_):
     seen = formation.arrays.observations[0] * SCALES
     formation.arrays.actions[0] = [[1.0, 0.5], [-0.5, -1.0], [0.0, 0.25]]
     formation.step()
-    full = np.array(range_ or (300.0, 3.0))
+    full = np.array(range_ or (100.0, 1.0))
     wanted = seen[:, [place("reference_u_1"), place("reference_u_2")]]
     wanted = wanted + full * [[1.0, 0.5], [-0.5, -1.0], [0.0, 0.25]]
     np.testing.assert_allclose(commanded(formation), wanted.T, rtol=0, atol=1e-9)

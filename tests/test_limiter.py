@@ -328,7 +328,7 @@ def test_a_residual_stays_within_the_limits_of_its_base():
 
 def test_on_board_and_from_outside_it_is_the_same_policy():
     fields = {"estimator": "ekf-slip", "disturbance": "combined-medium", "horizon_s": 20.0}
-    fields |= {"end_on": (), "residual_base": "tuned"}
+    fields |= {"end_on": (), "residual_base": "tuned", "action": "twist"}
     policy = ReferencePolicy("tuned", PERIOD_S, PREVIEW_S)
     single = FormationEnv("infinity", learner="robot_1", others="reference", **fields)
     env = tlf_env.parallel_env("infinity", **fields)

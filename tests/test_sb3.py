@@ -20,7 +20,7 @@ from baselines.sb3 import CHEAP_INFOS, FormationVecEnv
 from tlf_env import EndReason
 from tlf_env.task.info import INFO_KEYS
 
-SHORT = {"horizon_s": 2.0, "time_gap_s": 1.0, "preview_s": (0.5,)}
+SHORT = {"horizon_s": 2.0, "time_gap_s": 1.0, "preview_s": (0.5,), "action": "twist"}
 ROUGH = {**SHORT, "disturbance": "combined-hard", "lost_beyond_mm": 150.0}
 SMALL = {"n_steps": 32, "batch_size": 96, "n_epochs": 2, "device": "cpu"}
 

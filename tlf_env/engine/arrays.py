@@ -95,7 +95,7 @@ class Arrays(NamedTuple):
     paths: np.ndarray  # (x y, slot, robot, lane): true positions, ring over one gap and a window
     longest: np.ndarray  # (robot, lane): longest distance within a control step so far, mm
     # time and random numbers
-    clock: np.ndarray  # (lane, 3) int64: substeps, control steps, episode
+    clock: np.ndarray  # (lane, 4) int64: substeps, control steps, episode, control step of its end
     seeds: np.ndarray  # (lane,) int64
     # interface, formations first
     actions: np.ndarray  # (lane, robot, 2)
@@ -300,7 +300,7 @@ def make_arrays(
         references=np.zeros((len(Reference._fields), lookahead + 1, robots, columns)),
         paths=np.zeros((2, gap + window + 1, robots, columns)),
         longest=np.zeros((robots, columns)),
-        clock=np.zeros((lanes, 3), dtype=np.int64),
+        clock=np.zeros((lanes, 4), dtype=np.int64),
         seeds=np.zeros(lanes, dtype=np.int64),
         actions=np.zeros((lanes, robots, ACTION_SIZE)),
         last_actions=np.zeros((lanes, robots, ACTION_SIZE)),

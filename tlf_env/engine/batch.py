@@ -51,6 +51,10 @@ class BatchPlant:
         How many work on a step; None takes one for each core.
     mixture
         True, or a share for each scenario: every episode of a formation draws its scenario, by its seed.
+    staggered
+        Whether a reset of all formations spreads the ends of their episodes: that of formation k ends
+        after (k + 1)/formations of the horizon, the later ones at the horizon. For learners: otherwise
+        all formations are at the same time of their episodes in each rollout.
     **overrides
         Fields of all scenarios; ``disturbance_level`` too.
 
@@ -70,6 +74,7 @@ class BatchPlant:
         *,
         threads: int | None = 1,
         mixture: bool | Sequence[float] = False,
+        staggered: bool = False,
         **overrides: Any,
     ) -> None:
         if not isinstance(scenario, Sequence) or isinstance(scenario, str):
@@ -77,6 +82,10 @@ class BatchPlant:
         self.scenarios = _alike(_all_for_lanes(scenario, overrides))
         warn_of(self.scenarios)
         self.formations = checked_count("formations", formations)
+        if not isinstance(staggered, bool):
+            raise ValueError(f"staggered {shown(staggered)} must be True or False")
+        steps = self.scenario.horizon_steps * np.arange(1, self.formations + 1)
+        self._first_ends = np.maximum(steps // self.formations, 1) if staggered else None
         self.threads = checked_count("threads", os.cpu_count() or 1 if threads is None else threads)
         table = reference_table(self.scenario)
         self.arrays: Arrays = make_arrays(self.scenarios, table, self.formations)
@@ -138,6 +147,9 @@ class BatchPlant:
             arrays.seeds[fresh] = seeds[fresh]
         arrays.clock[chosen & ~fresh, 2] += 1
         arrays.clock[fresh, 2] = 0
+        arrays.clock[chosen, 3] = self.scenario.horizon_steps
+        if self._first_ends is not None and chosen.all():
+            arrays.clock[:, 3] = self._first_ends
         self._seeded |= chosen
         self._place(chosen, start)
         self._start(chosen)
@@ -263,7 +275,7 @@ class BatchPlant:
         RuntimeError
             if a formation was never reset, or is at its horizon.
         """
-        arrays, settings = self.arrays, self._settings
+        arrays = self.arrays
         given = real_numbers(actions)
         if given is None:
             raise ValueError(
@@ -278,13 +290,13 @@ class BatchPlant:
             raise ValueError(
                 f"formation {lane}, robot_{robot}: the action must be finite, got {given[lane, robot].tolist()}"
             )
-        if not self._seeded.all() or (arrays.clock[:, 1] >= settings.horizon).any():
-            over = np.flatnonzero(~self._seeded | (arrays.clock[:, 1] >= settings.horizon))
+        over = np.flatnonzero(~self._seeded | (arrays.clock[:, 1] >= arrays.clock[:, 3]))
+        if len(over):
             raise RuntimeError(f"formation {over[0]}: call reset() before step()")
         arrays.actions[:] = given
         threads = min(self.threads, -(-self.formations // drivers.LANES_AT_ONCE))
         left = drivers.lanes_to_step(0, self.formations, threads)
-        work = (arrays, left, self._nothing if excerpt is None else excerpt, settings)
+        work = (arrays, left, self._nothing if excerpt is None else excerpt, self._settings)
         helpers = [self._others().submit(drivers.control_step, *work) for _ in range(threads - 1)]
         drivers.control_step(*work)
         for helper in helpers:

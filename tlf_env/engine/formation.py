@@ -132,7 +132,7 @@ class Formation:
         trajectory.
         """
         arrays, settings = self.arrays, self._settings
-        arrays.clock[0], arrays.seeds[0] = (0, 0, episode), seed
+        arrays.clock[0], arrays.seeds[0] = (0, 0, episode, self.scenario.horizon_steps), seed
         phase_s = 0.0 if start.phases_s is None else float(start.phases_s[0])
         arrays.tables[0] = reference_table(self.scenario, phase_s) if phase_s else self._table
         poses = NO_POSES if start.poses is None else start.poses

@@ -277,7 +277,7 @@ def end_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
 
     See :func:`terminated` and :func:`truncated`.
     """
-    rest = HORIZON if arrays.clock[lane, 1] >= settings.horizon else RUNNING
+    rest = HORIZON if arrays.clock[lane, 1] >= arrays.clock[lane, 3] else RUNNING
     for robot in range(arrays.ends.shape[1]):
         arrays.ends[lane, robot] = RUNNING
         if settings.end_on_lost and arrays.lost_now[lane, robot]:

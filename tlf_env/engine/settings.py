@@ -29,7 +29,6 @@ class Settings(NamedTuple):
     period: float  # control period, s
     gap: int  # control steps of the time gap
     lookahead: int  # control steps of the longest preview
-    horizon: int  # control steps of an episode
     spacing: float  # mm between neighbours at the start
     window: int  # control steps around one gap ago in which the time gap is measured
     half_window: (
@@ -77,7 +76,6 @@ def make_settings(scenario: Scenario) -> Settings:
         period=scenario.control_period_s,
         gap=scenario.gap_steps,
         lookahead=max(scenario.preview_steps, default=0),
-        horizon=scenario.horizon_steps,
         spacing=scenario.start_spacing_mm,
         window=round(TIME_GAP_WINDOW_S / scenario.control_period_s),
         half_window=scenario.smoothing_steps,

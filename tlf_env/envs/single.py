@@ -18,7 +18,7 @@ from tlf_env.onboard.parts import Policy, load_part, make_part, predicted
 from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE, TWIST
 from tlf_env.task.info import InfoChoice
-from tlf_env.task.scenario import Scenario
+from tlf_env.task.scenario import Scenario, learners_action
 
 BY_REFERENCE = "reference"
 
@@ -71,7 +71,9 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
     infos
         Whether :meth:`reset` and :meth:`step` return infos; or a sequence of the keys to return.
     **overrides
-        Fields of the scenario; ``disturbance_level`` too.
+        Fields of the scenario; ``disturbance_level`` too. ``action`` is ``"tracking_twist"`` unless it, or
+        the scenario's file or mapping, says otherwise; a :class:`~tlf_env.task.scenario.Scenario` keeps
+        its own.
 
     Raises
     ------
@@ -94,7 +96,10 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         **overrides: Any,
     ) -> None:
         self.formation_env = FormationParallelEnv(
-            scenario, render_mode=render_mode, infos=infos, **overrides
+            scenario,
+            render_mode=render_mode,
+            infos=infos,
+            **learners_action(scenario, overrides),
         )
         agents = self.formation_env.possible_agents
         if learner is None:

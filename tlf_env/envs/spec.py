@@ -42,7 +42,19 @@ def entry_rows(entries: dict[str, Entry], first: int = 0) -> list[tuple[str, ...
     ]
 
 
+DEFAULT_ACTIONS = """In `gymnasium.make`, `make_vec` and `FormationVecEnv` the action is by default
+`tracking_twist`: an action of zero follows the reference, and exploring does not end the episode in the first
+seconds. Elsewhere, as in `parallel_env`, it is `twist`, the action that the reference policies answer with.
+The field `action` of a call, a file or a mapping counts before that, and a `Scenario` keeps its own."""
+
+LOST_NEVER_PAYS = """With the default weights a robot that has an action of zero and wheels that do not slip
+never has a negative reward, so that being lost is never the best choice. `far` changes that: an `alive` of at
+least as much per step as the largest `far` (`reward={"far": -1.0, "alive": 1.2}`, as robots are lost beyond
+1200 mm) makes up for it. A reward under which being lost pays gives a `ReferenceWarning`."""
+
 LIMITED = """`action_range=(300.0, 3.0)` sets what 1.0 means in `tracking_twist` and `residual`, mm/s and rad/s.
+Learners that begin with actions of standard deviation 1, as those of SB3, need a range about as small as the
+default one: with 300 mm/s and 3 rad/s they hardly learn ([learning.md](learning.md#from-nothing)).
 
 `limiter` puts a [limiter](systems.md#limiters) behind the actions `twist`, `wheel_speed` and `tracking_twist`:
 a preset, a file or a mapping. Motors and tyres can follow what it lets through. It is the law that limits a
@@ -67,6 +79,8 @@ def action_section() -> str:
         '`Box(−1, 1, (2,))`, float32 (float64 with `dtype="float64"`). Finite values outside are clipped '
         "and counted.\n\n"
         + table(("action", "index", "meaning", "1.0 means"), rows)
+        + "\n\n"
+        + DEFAULT_ACTIONS
         + "\n\n"
         + LIMITED
     )
@@ -125,6 +139,8 @@ def reward_section() -> str:
         "The weighted sum of the terms, separately for each robot. `reward={term: weight}` changes weights; "
         "`cooperative=True` gives every robot the mean over the formation.\n\n"
         + table(("term", "meaning", "weight"), rows)
+        + "\n\n"
+        + LOST_NEVER_PAYS
     )
 
 
@@ -304,6 +320,9 @@ those of single environments.
   of an episode: to make another environment from it with a longer `horizon_s`, pass `max_episode_steps=-1`.
 - With a sequence of scenarios and `mixture=True` or shares, every episode draws its scenario (domain
   randomisation).
+- With `staggered=True` the episodes that a reset of all formations starts end at different times: that of
+  formation k after (k + 1)/formations of the horizon, and all later ones at the horizon. Otherwise each
+  rollout of a learner would have all formations at the same time of their episodes.
 """
 
 

@@ -22,7 +22,7 @@ from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE, REFERENCE
 from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
-from tlf_env.task.scenario import Scenario, load_scenario
+from tlf_env.task.scenario import Scenario, learners_action, load_scenario
 from tlf_env.task.start import start_options
 from tlf_env.task.warn import callers_level
 
@@ -70,6 +70,9 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         Number of threads for a step; None: one per core.
     mixture
         True, or a share for each scenario: every episode draws its scenario.
+    staggered
+        Whether the first episodes end at different times; as in
+        :class:`~tlf_env.engine.batch.BatchPlant`.
     autoreset_mode
         ``NextStep`` (Gymnasium's default), ``SameStep`` or ``Disabled``.
     max_episode_steps
@@ -80,7 +83,8 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
     render_mode
         None.
     **overrides
-        Fields of the scenarios; ``disturbance_level`` too.
+        Fields of the scenarios; ``disturbance_level`` too. ``action`` is by default that of
+        :class:`~tlf_env.envs.single.FormationEnv`.
 
     Raises
     ------
@@ -99,6 +103,7 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         others: str = BY_REFERENCE,
         threads: int | None = 1,
         mixture: bool | Sequence[float] = False,
+        staggered: bool = False,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
@@ -109,7 +114,14 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             raise TypeError("unexpected keyword argument 'formations'; use num_envs")
         if max_episode_steps is not None:
             overrides |= shortened(scenario, max_episode_steps, overrides)
-        self.plant = BatchPlant(scenario, num_envs, threads=threads, mixture=mixture, **overrides)
+        self.plant = BatchPlant(
+            scenario,
+            num_envs,
+            threads=threads,
+            mixture=mixture,
+            staggered=staggered,
+            **learners_action(scenario, overrides),
+        )
         self._info_keys = chosen_keys(infos)
         self._mask_keys = [f"_{key}" for key in self._info_keys]
         self._info_rows = [INFO_KEYS.index(key) for key in self._info_keys]

@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Mapping
 from typing import NamedTuple
+
+import numpy as np
 
 from tlf_env.numerics.compiled import law
 
@@ -23,6 +26,7 @@ class RewardTerms(NamedTuple):
     slip: float
     lost: float
     touched: float
+    alive: float
 
 
 REWARD_MEANINGS = {
@@ -35,6 +39,7 @@ REWARD_MEANINGS = {
     "slip": "largest slip speed of a drive wheel in the step, in 100 mm/s",
     "lost": "1 in the step in which the robot is lost",
     "touched": "1 in the step in which the robot first touches another robot, a wall or an obstacle",
+    "alive": "1 in every step in which neither happens; a weight of it outweighs `far`",
 }
 
 DEFAULT_WEIGHTS = RewardTerms(
@@ -47,6 +52,7 @@ DEFAULT_WEIGHTS = RewardTerms(
     slip=-0.05,
     lost=-20.0,
     touched=-20.0,
+    alive=0.0,
 )
 
 
@@ -65,4 +71,24 @@ def reward_terms(
         slip=slip / SLIP_UNIT_MM_S,
         lost=1.0 if lost else 0.0,
         touched=1.0 if touched else 0.0,
+        alive=0.0 if lost or touched else 1.0,
     )
+
+
+def least_reward(weights: Mapping[str, float], lost_beyond_mm: float) -> tuple[float, float]:
+    """The smallest reward of a step that a robot cannot avoid, and its position error in mm.
+
+    A robot that is not lost can always have an action of zero, and wheels that do not slip; then its reward
+    depends on its error alone, 0 to ``lost_beyond_mm``. If the smallest is negative, being lost may be the
+    best choice: it costs ``lost`` once, driving on this much in every step.
+    """
+    errors_mm = np.append(np.geomspace(0.01, lost_beyond_mm, 1000), 0.0)
+    rewards = (
+        weights["alive"]
+        + weights["far"] * errors_mm / FAR_MM
+        + weights["coarse"] * np.exp(-errors_mm / 100.0)
+        + weights["medium"] * np.exp(-errors_mm / 10.0)
+        + weights["fine"] * np.exp(-errors_mm / 2.0)
+    )
+    worst = int(np.argmin(rewards))
+    return float(rewards[worst]), float(errors_mm[worst])

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Self
 
@@ -61,7 +61,7 @@ from tlf_env.task.feasibility import (
     warnings_for,
 )
 from tlf_env.task.observation import Entry
-from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms
+from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms, least_reward
 from tlf_env.task.trajectories import Trajectory
 from tlf_env.task.waypoints import MAX_MAGNITUDE, scenario_of_waypoints
 
@@ -70,6 +70,7 @@ DEFAULT_CONTROL_PERIOD_S = 0.02
 DEFAULT_PREVIEW_S = (0.5, 1.0)
 BROADCAST_SMOOTHING_S = 0.1  # by default, where there is room
 SETTLE_FRACTION = 0.4
+LEARNERS_ACTION: ActionKind = "tracking_twist"  # of environments in which one robot, or all, learn
 START_MARGIN_MM = 1.0  # smallest distance between outlines at the start
 DIVIDES_TOLERANCE = 1e-9
 MAX_STEPS = 10_000_000
@@ -170,7 +171,7 @@ class Scenario(Frozen):
     adversary: Switch = False  # whether a caller may set disturbance channels at every step
 
     action: ActionKind = "twist"
-    # What 1.0 means in the actions `residual` and `tracking_twist`, mm/s and rad/s; None: 150 and 1, 300 and 3.
+    # What 1.0 means in the actions `residual` and `tracking_twist`, mm/s and rad/s; None: 150 and 1, 100 and 1.
     action_range: tuple[Positive, Positive] | None = None
     # What the actions `twist`, `wheel_speed` and `tracking_twist` are limited by: a preset, a file or a
     # mapping. None: the default's limiter for `tracking_twist`, no limits for the others.
@@ -533,6 +534,28 @@ def load_scenario(
     return scenario_with(source, overrides, disturbance_level)
 
 
+def learners_action(source: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
+    """The overrides with the action that learners have by default, if nothing says which.
+
+    A :class:`Scenario` is complete: its action stays. Of several sources the first decides.
+
+    Raises
+    ------
+    ValueError
+        for an unknown preset, or a file that cannot be read.
+    """
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        source = next(iter(source), {})
+    if overrides.get("action") is not None or isinstance(source, Scenario):
+        return dict(overrides)
+    given = source
+    if not isinstance(source, Mapping):
+        given = _read_source(source, overrides.get("control_period_s"))
+    if given.get("action") is not None:
+        return dict(overrides)
+    return {**overrides, "action": LEARNERS_ACTION}
+
+
 def scenario_with(
     source: str | Path | Mapping[str, Any] | Scenario,
     fields: Mapping[str, Any],
@@ -686,11 +709,19 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             f"residual_base {scenario.residual_base!r} subtracts the estimated slip from its commands, "
             "but estimator 'ekf' estimates none; use 'ekf-gyro' or 'ekf-slip'"
         )
-    if scenario.estimator == "ekf" and scenario.action_limiter.limits.cancel_slip:
+    if scenario.estimator == "ekf" and scenario.limiter and scenario.limiter.limits.cancel_slip:
         lines.append(
             "the limiter subtracts the estimated slip from an action's twist, but estimator 'ekf' estimates "
             "none; use 'ekf-gyro' or 'ekf-slip'"
         )
+    least, error_mm = least_reward(scenario.reward, scenario.lost_beyond_mm)
+    for end in scenario.end_on:
+        if least * scenario.horizon_steps < scenario.reward[end]:
+            lines.append(
+                f"reward: a robot {error_mm:g} mm from its reference receives {least:.3g} in every step, so "
+                f"that being {end}, {scenario.reward[end]:g} once, may be better than driving on; reward.alive "
+                f"{max(scenario.reward['alive'] - least, 0.0):.3g} and reward.{end} below 0 prevent it"
+            )
     return list(dict.fromkeys(lines))
 
 
