@@ -23,6 +23,7 @@ from tlf_env.common.errors import one_line
 from tlf_env.common.files import atomic, parse_json
 from tlf_env.common.models import Frozen, NonNegative, Positive, Whole
 from tlf_env.onboard.limiters import Limiter
+from tlf_env.onboard.parts import is_part
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.actions import ActionKind
@@ -76,6 +77,11 @@ class Card(Frozen):
             raise ValueError(
                 f"residual_base goes with the action 'residual', and only with it; got "
                 f"{self.residual_base!r} with {self.action!r}"
+            )
+        if is_part(self.residual_base):
+            raise ValueError(
+                f"residual_base {self.residual_base!r} is a policy in Python, which would be run; a card may "
+                "name a controller's preset or file"
             )
         if self.action == "residual" and self.estimator is None:
             raise ValueError("estimator must be named if the action is 'residual'")

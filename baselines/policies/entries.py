@@ -18,6 +18,7 @@ from tlf_env.common.presets import read_yaml
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS
 from tlf_env.onboard.limiters import Limiter
+from tlf_env.onboard.parts import is_part
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.supervisor import Neighbour
@@ -54,6 +55,13 @@ class AskedFields(Frozen):
         allowed = [kind for kind in ESTIMATOR_KINDS if kind != "truth"]
         if value is not None and value not in allowed:
             raise ValueError(f"must be one of {', '.join(allowed)}, got {value!r}")
+        return value
+
+    @field_validator("residual_base")
+    @classmethod
+    def _no_code(cls, value: str | None) -> str | None:
+        if is_part(value):
+            raise ValueError(f"must be a controller's preset or file, got {value!r}")
         return value
 
 

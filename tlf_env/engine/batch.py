@@ -16,6 +16,7 @@ from tlf_env.engine import drivers, judging, readout
 from tlf_env.engine.arrays import Arrays, make_arrays, make_variants
 from tlf_env.engine.excerpt import Excerpt, empty_excerpt
 from tlf_env.engine.formation import NO_POSES, reference_table, refusal
+from tlf_env.engine.outside_base import make_base, separate_base
 from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import STARTED
 from tlf_env.numerics.compiled import compile_for
@@ -79,6 +80,7 @@ class BatchPlant:
     ) -> None:
         if not isinstance(scenario, Sequence) or isinstance(scenario, str):
             scenario = [scenario]
+        overrides, base = separate_base(overrides)
         self.scenarios = _alike(_all_for_lanes(scenario, overrides))
         warn_of(self.scenarios)
         self.formations = checked_count("formations", formations)
@@ -89,6 +91,7 @@ class BatchPlant:
         self.threads = checked_count("threads", os.cpu_count() or 1 if threads is None else threads)
         table = reference_table(self.scenario)
         self.arrays: Arrays = make_arrays(self.scenarios, table, self.formations)
+        self._base = make_base(self.scenario, base)
         self._variants = make_variants(self.scenarios, _shares(mixture, len(self.scenarios)))
         each = [make_settings(one) for one in self.scenarios]
         self._settings = each[0]._replace(changing=any(one.changing for one in each))
@@ -294,6 +297,8 @@ class BatchPlant:
         if len(over):
             raise RuntimeError(f"formation {over[0]}: call reset() before step()")
         arrays.actions[:] = given
+        if self._base is not None:
+            self._base.command(arrays)
         threads = min(self.threads, -(-self.formations // drivers.LANES_AT_ONCE))
         left = drivers.lanes_to_step(0, self.formations, threads)
         work = (arrays, left, self._nothing if excerpt is None else excerpt, self._settings)

@@ -56,8 +56,9 @@ from tlf_env.task.actions import (
     FULL_SPEED_MM_S,
     FULL_TORQUE_NMM,
     FULL_YAW_RATE_RAD_S,
+    LIMITED_OUTSIDE_RESIDUAL,
     LIMITED_TWIST,
-    LIMITED_WHEEL_SPEED,
+    OUTSIDE_RESIDUAL,
     REFERENCE,
     RESIDUAL,
     TORQUE,
@@ -102,10 +103,17 @@ def command(arrays: Arrays, lane: int, robot: int, settings: Settings) -> tuple[
         u_2 += share * a_1 * settings.full_2
         given[0], given[1] = twist_action(seen, arrays.scales, settings.base, u_1, u_2)
         return wheel_command(given[0], given[1], TWIST, body, belief)
-    if kind not in (TRACKING_TWIST, LIMITED_TWIST, LIMITED_WHEEL_SPEED):
+    if kind in (TWIST, WHEEL_SPEED, REFERENCE):
         return wheel_command(a_0, a_1, kind, body, belief)
     seen, given = arrays.observations[lane, robot], arrays.twists[lane, robot]
-    if kind == TRACKING_TWIST:
+    if kind in (OUTSIDE_RESIDUAL, LIMITED_OUTSIDE_RESIDUAL):  # `given` is the policy's action
+        share = residual_share(seen, arrays.scales, settings.residual_fade, settings.residual_reach)
+        given[0] = clipped_action(given[0] + share * a_0 * settings.full_1 / FULL_SPEED_MM_S)
+        given[1] = clipped_action(given[1] + share * a_1 * settings.full_2 / FULL_YAW_RATE_RAD_S)
+        if kind == OUTSIDE_RESIDUAL:
+            return wheel_command(given[0], given[1], TWIST, body, belief)
+        u_1, u_2 = given[0] * FULL_SPEED_MM_S, given[1] * FULL_YAW_RATE_RAD_S
+    elif kind == TRACKING_TWIST:
         u_1, u_2 = led_reference(seen, arrays.scales, settings.limits.lead)
         u_1, u_2 = u_1 + a_0 * settings.full_1, u_2 + a_1 * settings.full_2
     elif kind == LIMITED_TWIST:

@@ -29,6 +29,7 @@ from tlf_env.engine.arrays import (
 )
 from tlf_env.engine.excerpt import empty_excerpt
 from tlf_env.engine.layout import Traction, rows_of
+from tlf_env.engine.outside_base import make_base
 from tlf_env.engine.outside_parts import Parts, part_factories
 from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import IN_WALL, OFF_BASE, START_ATTEMPTS, STARTED
@@ -89,16 +90,20 @@ class Formation:
 
     Units: mm, s, rad; arrays are views that the next step overwrites. ``parts`` gives factories for
     the ``estimator``, ``wheel_loop`` or ``observer`` that the scenario names, if they are given
-    as objects; the others are imported by name.
+    as objects; the others are imported by name. ``base`` is the policy that ``residual_base`` names, if it
+    is given as an object.
     """
 
-    def __init__(self, scenario: Scenario, parts: Mapping[str, Factory] | None = None) -> None:
+    def __init__(
+        self, scenario: Scenario, parts: Mapping[str, Factory] | None = None, base: Any = None
+    ) -> None:
         self.scenario = scenario
         self._table = reference_table(scenario)
         self.arrays: Arrays = make_arrays([scenario], self._table)
         self._variants = make_variants([scenario])
         kind = ChipmunkPlant if scenario.plant == "chipmunk" else PymunkPlant
         self.plant = kind(scenario.robot_models, scenario.world, scenario.control_period_s)
+        self._base = make_base(scenario, base)
         self._parts = Parts(part_factories(scenario, parts or {}), scenario)
         self._settings = make_settings(scenario)
         self._has_rays = scenario.rays is not None
@@ -208,6 +213,8 @@ class Formation:
             a robot, on a plant without contact. Then nothing has changed.
         """
         arrays, settings = self.arrays, self._settings
+        if self._base is not None and np.isfinite(arrays.actions).all():
+            self._base.command(arrays)
         objects, step = NO_OBJECTS, 0
         if self.plant.occupied:
             step = self.step_count

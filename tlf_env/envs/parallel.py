@@ -19,6 +19,7 @@ from tlf_env.disturbances.channels import CHANNELS
 from tlf_env.disturbances.model import PatchRow, patch_rows
 from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, state_dtype
 from tlf_env.engine.judging import TERMINATES, TRUNCATES
+from tlf_env.engine.outside_base import separate_base
 from tlf_env.engine.readout import info_rows
 from tlf_env.envs.spec import documented
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
@@ -83,6 +84,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         infos: InfoChoice = True,
         **overrides: Any,
     ) -> None:
+        overrides, base = separate_base(overrides)
         overrides, parts = separate_parts(overrides)
         if adversary is not None:
             if not callable(adversary):
@@ -105,7 +107,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.possible_agents = [f"robot_{i}" for i in range(self.scenario.robot_count)]
         self.agents: list[Agent] = []
-        self._formation = Formation(self.scenario, parts)
+        self._formation = Formation(self.scenario, parts, base)
         # Channels that stay for a whole episode are taken from its first infos.
         self._varying = np.array(
             [

@@ -16,7 +16,7 @@ from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.envs.spec import documented
 from tlf_env.onboard.parts import Policy, load_part, make_part, predicted
 from tlf_env.rendering.looks import RENDER_MODES
-from tlf_env.task.actions import ACTION_SIZE, REFERENCE, TWIST
+from tlf_env.task.actions import ACTION_SIZE, TWIST
 from tlf_env.task.info import InfoChoice
 from tlf_env.task.scenario import Scenario, learners_action
 
@@ -115,7 +115,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         self._driver = self._make_driver(others)
         self._driver_state: Any = None
         kinds = self.formation_env.formation.arrays.kinds
-        kinds[self._rest] = REFERENCE if self._driver is None else TWIST
+        kinds[self._rest] = self.scenario.reference_kind if self._driver is None else TWIST
         self._driver_start = np.ones(len(self._rest), dtype=np.bool_)
         self._still = {
             agents[i]: np.zeros(ACTION_SIZE, self.action_space.dtype) for i in self._rest

@@ -63,6 +63,10 @@ limiter's `lead_s` shifts the reference that `tracking_twist` adds to; its super
 default `twist` and `wheel_speed` are not limited, and `tracking_twist` is, by the default system's `grip`;
 `limiter="none"` takes that away. A `residual` has the limits of its `residual_base`.
 
+`residual_base` is a controller, by its preset or file, or a policy in Python: an object with SB3's `predict`
+from `tracking` observations to `twist` actions, or `"module:factory"` of one. Such a policy runs once a control
+step for all robots, also in a batch, and a `limiter` may limit the sum.
+
 ```python
 env = tlf_env.parallel_env("infinity", action="tracking_twist", limiter="body")
 ```"""

@@ -19,7 +19,7 @@ from tlf_env.engine.batch import BatchPlant, checked_count
 from tlf_env.engine.excerpt import END_ROW, REWARD_ROW, Excerpt
 from tlf_env.envs.single import BY_REFERENCE, HasSpec
 from tlf_env.onboard.parts import real_numbers
-from tlf_env.task.actions import ACTION_SIZE, REFERENCE
+from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario, learners_action, load_scenario
@@ -148,7 +148,8 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             raise ValueError(f"autoreset_mode {autoreset_mode!r} is not one of {modes}") from error
         self.learner = learner
         self._robot = agents.index(learner)
-        self.plant.arrays.kinds[[i for i in range(robots) if i != self._robot]] = REFERENCE
+        others_of = [i for i in range(robots) if i != self._robot]
+        self.plant.arrays.kinds[others_of] = self.scenario.reference_kind
         self.num_envs = self.plant.formations
         self.metadata = {
             "render_modes": [],

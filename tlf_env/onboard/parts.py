@@ -10,6 +10,7 @@ from __future__ import annotations
 import importlib
 import inspect
 import math
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -183,6 +184,11 @@ def make_part(role: str, name: str, factory: Factory, *given: Any) -> Any:
                 f"{error}{hint}"
             ) from error
     return part
+
+
+def is_part(name: str | None) -> bool:
+    """Whether a name is ``module:factory``: code that is run, in place of a preset or a file of numbers."""
+    return name is not None and re.match(PART_PATTERN, name) is not None
 
 
 def part_name(factory: Factory) -> str:

@@ -23,6 +23,7 @@ TWIST, WHEEL_SPEED, TORQUE, RESIDUAL, TRACKING_TWIST = range(5)
 LIMITED_TWIST, LIMITED_WHEEL_SPEED = 5, 6  # behind the scenario's limiter
 REFERENCE = 7  # the twist of the reference controller instead of an action
 EXTERNAL_TORQUE = 8  # what a wheel loop in Python makes of any of them but TORQUE
+OUTSIDE_RESIDUAL, LIMITED_OUTSIDE_RESIDUAL = 9, 10  # on a policy in Python
 ActionKind = Literal["twist", "wheel_speed", "torque", "residual", "tracking_twist"]
 ACTION_KINDS: dict[ActionKind, int] = {
     "twist": TWIST,
@@ -35,6 +36,11 @@ LIMITED_KINDS: dict[ActionKind, int] = {
     "twist": LIMITED_TWIST,
     "wheel_speed": LIMITED_WHEEL_SPEED,
     "tracking_twist": TRACKING_TWIST,
+}
+OUTSIDE_KINDS: dict[ActionKind, int] = {"residual": OUTSIDE_RESIDUAL}
+LIMITED_OUTSIDE_KINDS: dict[ActionKind, int] = {
+    **LIMITED_KINDS,
+    "residual": LIMITED_OUTSIDE_RESIDUAL,
 }
 RANGED_KINDS: tuple[ActionKind, ...] = ("residual", "tracking_twist")  # action_range is theirs
 

@@ -37,7 +37,7 @@ from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.limiters import DEFAULT_LIMITER, Limiter, load_limiter
 from tlf_env.onboard.observer import ObserverParameters
-from tlf_env.onboard.parts import PART_PATTERN
+from tlf_env.onboard.parts import is_part
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.supervisor import Neighbour
@@ -48,7 +48,11 @@ from tlf_env.physics.world import World
 from tlf_env.task.actions import (
     ACTION_KINDS,
     LIMITED_KINDS,
+    LIMITED_OUTSIDE_KINDS,
+    OUTSIDE_KINDS,
+    OUTSIDE_RESIDUAL,
     RANGED_KINDS,
+    REFERENCE,
     ActionKind,
     action_entries,
 )
@@ -93,7 +97,7 @@ EndCondition = Literal["lost", "touched"]
 
 
 def _part_path(value: str) -> str:
-    if not re.match(PART_PATTERN, value):
+    if not is_part(value):
         raise PydanticCustomError("part_path", "Input should be module:factory")
     return value
 
@@ -176,7 +180,8 @@ class Scenario(Frozen):
     # What the actions `twist`, `wheel_speed` and `tracking_twist` are limited by: a preset, a file or a
     # mapping. None: the default's limiter for `tracking_twist`, no limits for the others.
     limiter: Limiter | None = None
-    # Base controller of the action `residual`, which is added to its twist: a preset or a file.
+    # Base controller of the action `residual`, which is added to its twist: a preset, a file, or a policy in
+    # Python, `module:factory`.
     residual_base: str = DEFAULT_CONTROLLER
     # Estimated errors at which a residual has half its weight: the weight decreases below the first and
     # above the second. 0 and None: it does not.
@@ -340,9 +345,10 @@ class Scenario(Frozen):
             )
         if self.limiter is None:
             return
-        if self.action not in LIMITED_KINDS:
+        limited = LIMITED_OUTSIDE_KINDS if self.outside_base else LIMITED_KINDS
+        if self.action not in limited:
             raise ValueError(
-                f"limiter goes with the actions {', '.join(LIMITED_KINDS)}, not with {self.action!r}"
+                f"limiter goes with the actions {', '.join(limited)}, not with {self.action!r}"
             )
         if self.limiter.lead_s and not can_lead(self.preview_s):
             raise ValueError(
@@ -399,6 +405,11 @@ class Scenario(Frozen):
             for role, part in named.items()
             if isinstance(part, str) and part not in ESTIMATOR_KINDS
         }
+
+    @property
+    def outside_base(self) -> str | None:
+        """The policy in Python that ``residual_base`` names, ``module:factory``; None: it is a controller."""
+        return self.residual_base if is_part(self.residual_base) else None
 
     @property
     def privileged(self) -> bool:
@@ -469,8 +480,12 @@ class Scenario(Frozen):
 
     @property
     def base_controller(self) -> Controller:
-        """The controller of ``residual_base``; the default goes without its lead where no preview is ahead."""
-        return controller_for(self.residual_base, self.preview_s)
+        """The controller of ``residual_base``; the default goes without its lead where no preview is ahead.
+
+        The default too where the base is a policy in Python.
+        """
+        named = DEFAULT_CONTROLLER if self.outside_base else self.residual_base
+        return controller_for(named, self.preview_s)
 
     @property
     def action_entries(self) -> tuple[Entry, ...]:
@@ -491,7 +506,14 @@ class Scenario(Frozen):
     def action_kind(self) -> int:
         """Code of the action in the compiled drivers."""
         limited = self.limiter is not None and self.limiter != Limiter()
+        if self.outside_base:
+            return (LIMITED_OUTSIDE_KINDS if limited else ACTION_KINDS | OUTSIDE_KINDS)[self.action]
         return (LIMITED_KINDS if limited else ACTION_KINDS)[self.action]
+
+    @property
+    def reference_kind(self) -> int:
+        """Code, in the compiled drivers, of a robot that the controller ``residual_base`` drives."""
+        return OUTSIDE_RESIDUAL if self.outside_base else REFERENCE
 
     @property
     def settle_s(self) -> float:
@@ -704,6 +726,7 @@ def scenario_warnings(scenario: Scenario) -> list[str]:
             "start at the centre of the outline, so that they meet nothing outside"
         )
     drives = scenario.action == "residual" or scenario.residual_base != DEFAULT_CONTROLLER
+    drives = drives and not scenario.outside_base
     if drives and scenario.estimator == "ekf" and scenario.base_controller.limits.cancel_slip:
         lines.append(
             f"residual_base {scenario.residual_base!r} subtracts the estimated slip from its commands, "

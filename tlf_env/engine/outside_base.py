@@ -1,0 +1,79 @@
+"""A policy in Python as the base of the action ``residual``; it runs once a control step, for all robots."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tlf_env.common.errors import shown
+from tlf_env.engine.arrays import Arrays
+from tlf_env.onboard.parts import Policy, load_part, make_part, part_name, predicted
+from tlf_env.task.actions import ACTION_SIZE
+from tlf_env.task.scenario import Scenario
+
+ROLE = "residual_base"
+
+
+def separate_base(overrides: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
+    """Split off a ``residual_base`` that is given as an object: overrides with its name, and the object.
+
+    The object is None if there is none; then the scenario names a controller, or ``"module:factory"``.
+    """
+    base = overrides.get(ROLE)
+    if isinstance(base, Path):
+        base = str(base)
+    if base is None or isinstance(base, str):
+        return {**overrides, ROLE: base}, None
+    named = base if callable(base) else type(base)
+    return {**overrides, ROLE: part_name(named)}, base
+
+
+def make_base(scenario: Scenario, given: Any = None) -> OutsideBase | None:
+    """The base of a scenario that is a policy in Python; None if its base is a controller.
+
+    Parameters
+    ----------
+    given
+        The policy, or a factory of it; None: what the scenario names is imported.
+
+    Raises
+    ------
+    ValueError
+        for a policy that cannot be imported or made, or that has no ``predict``.
+    """
+    path = scenario.outside_base
+    if path is None:
+        return None
+    if given is None:
+        return OutsideBase(path, make_part(ROLE, path, load_part(path)))
+    return OutsideBase(path, make_part(ROLE, path, given if callable(given) else lambda: given))
+
+
+class OutsideBase:
+    """A policy with SB3's ``predict`` from ``tracking`` observations to ``twist`` actions, and its state."""
+
+    def __init__(self, name: str, policy: Policy) -> None:
+        self._name, self._policy = name, policy
+        self._state: Any = None
+
+    def command(self, arrays: Arrays) -> None:
+        """Write the twists of all robots in all formations, as actions, for the coming step.
+
+        Raises
+        ------
+        ValueError
+            for actions of another shape or not finite; nothing has changed.
+        """
+        lanes, robots, entries = arrays.observations.shape
+        starts = np.repeat(arrays.clock[:lanes, 1] == 0, robots)
+        seen = arrays.observations.reshape(-1, entries).copy()
+        what = f"{ROLE} {self._name!r}"
+        answer = self._policy.predict(seen, self._state, starts, True)
+        actions, state = predicted(answer, (len(seen), ACTION_SIZE), what)
+        if not np.isfinite(actions).all():
+            raise ValueError(f"{what}: the actions must be finite, got {shown(actions)}")
+        arrays.twists[:] = np.clip(actions, -1.0, 1.0).reshape(arrays.twists.shape)
+        self._state = state
