@@ -125,24 +125,29 @@ class FormationVecEnv(VecEnv):
         self._made_at_s = time.monotonic()
         self._returns = np.zeros(self.num_envs)
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
-        self._last_ends: deque[int] = deque(maxlen=ENDS_KEPT)
+        self.last_ends: deque[int] = deque(maxlen=ENDS_KEPT)  # of robots, as in EndReason
 
     def clear_statistics(self) -> None:
         """Count the running episodes from now on, and forget how others ended."""
         self._returns[:], self._lengths[:] = 0.0, 0
-        self._last_ends.clear()
+        self.last_ends.clear()
 
     def end_shares(self) -> dict[str, float]:
         """How the last 100 episodes of robots ended: the share of each :class:`~tlf_env.EndReason`.
 
         All are 0 before the first end.
         """
-        ended = max(len(self._last_ends), 1)
+        ended = max(len(self.last_ends), 1)
         return {
-            reason.name.lower(): self._last_ends.count(reason) / ended
+            reason.name.lower(): self.last_ends.count(reason) / ended
             for reason in EndReason
             if reason is not EndReason.RUNNING
         }
+
+    def set_shares(self, mixture: bool | Sequence[float]) -> None:
+        """As :meth:`~tlf_env.engine.batch.BatchPlant.set_shares`, for the scenarios of every task."""
+        for plant in self.plants:
+            plant.set_shares(mixture)
 
     def _spaces_agree(self) -> None:
         first = self.plants[0].scenario
@@ -303,7 +308,7 @@ class FormationVecEnv(VecEnv):
                     "l": int(self._lengths[i]),
                     "t": time_s,
                 }
-            self._last_ends.extend(ends[dones].tolist())
+            self.last_ends.extend(ends[dones].tolist())
             self._returns[dones], self._lengths[dones] = 0.0, 0
             for plant in self.plants:
                 plant.reset_finished()

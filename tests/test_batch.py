@@ -281,6 +281,30 @@ def test_episodes_draw_their_scenario_from_a_mixture():
     assert even.scenario_numbers.mean() == pytest.approx(0.5, abs=0.06)
 
 
+def test_shares_of_a_mixture_change_with_the_next_episodes():
+    scenarios = [
+        load_scenario("infinity", disturbance=name, **SHORT) for name in ("none", "ice", "slip")
+    ]
+    plant = BatchPlant(scenarios, 300, mixture=[1, 0, 0])
+    plant.reset(0)
+    assert set(plant.scenario_numbers) == {0}
+    plant.set_shares([0.1, 0.2, 0])
+    assert set(plant.scenario_numbers) == {0}
+    plant.reset()
+    assert set(plant.scenario_numbers) == {0, 1}
+    assert (plant.scenario_numbers == 1).mean() == pytest.approx(2 / 3, abs=0.1)
+    made_so = BatchPlant(scenarios, 300, mixture=[0.1, 0.2, 0])
+    made_so.reset(0)
+    made_so.reset()
+    assert np.array_equal(made_so.scenario_numbers, plant.scenario_numbers)
+    with pytest.raises(ValueError, match="True or 3 shares"):
+        plant.set_shares([1.0, 1.0])
+    with pytest.raises(ValueError, match="mixture False must be True or 3 shares"):
+        plant.set_shares(False)
+    with pytest.raises(ValueError, match="shares need a plant with a mixture"):
+        BatchPlant("infinity", 2).set_shares(True)
+
+
 @pytest.mark.parametrize(
     ("change", "said"),
     [

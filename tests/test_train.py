@@ -46,6 +46,11 @@ ALGORITHMS = {
         "checkpoint_every": 768,
         "settings": {"buffer_size": 2000, "learning_starts": 100, "batch_size": 32},
     },
+    "PPO with a curriculum": {
+        "curriculum": {"failed_share": 0.9},
+        "tasks": {"infinity": {"horizon_s": 0.2}},
+        "scenario": {**CONFIG["scenario"], "time_gap_s": 0.1, "preview_s": [0.02]},
+    },
     "RecurrentPPO": {
         "algorithm": "RecurrentPPO",
         "network": {"hidden": [8], "lstm": 8},
@@ -89,6 +94,12 @@ def test_shipped_configs_are_valid(path: Path):
             "RecurrentPPO, and no other algorithm, needs network.lstm; got None",
         ),
         ({"settings": {"seed": 3}}, "settings.seed is set by the training"),
+        (
+            {"levels": [1.0], "curriculum": {}},
+            "at least two levels that increase, got levels [1.0]",
+        ),
+        ({"levels": [1.0, 0.5], "curriculum": {}}, "that increase, got levels [1.0, 0.5]"),
+        ({"curriculum": {"failed_share": 1.0}}, "failed_share: Input should be less than 1"),
         ({"algorithm": "SAC", "imitation": {}}, "imitation needs algorithm PPO, got SAC"),
     ],
 )
@@ -100,7 +111,7 @@ def test_a_wrong_config_is_reported_in_one_line(changes: dict, said: str):
 
 def test_presets_have_names():
     assert load_config("quick") == load_config(presets_folder("training") / "quick.yaml")
-    with pytest.raises(ValueError, match="training 'quickly' is not one of direct, quick"):
+    with pytest.raises(ValueError, match="training 'quickly' is not one of curriculum, direct"):
         load_config("quickly")
 
 
@@ -133,11 +144,15 @@ class TestTraining:
         pytest.importorskip("sb3_contrib")
 
     @pytest.mark.parametrize("name", ALGORITHMS)
-    def test_an_interrupted_training_continues_to_the_same_policy(self, name, tmp_path):
+    def test_an_interrupted_training_continues_to_the_same_policy(
+        self, name, tmp_path, monkeypatch
+    ):
         from baselines.training.train import CHECKPOINT_FILE, POLICY_FILE, train
 
+        monkeypatch.setattr("baselines.sb3.ENDS_KEPT", 20)
         config = load_config({**CONFIG, **ALGORITHMS[name]})
         whole = train(config, 3, tmp_path / "whole")
+        assert whole["level_count"] == (2 if config.curriculum else 1)
         stops = []
 
         def interrupt(done: int, total: int) -> None:
@@ -333,6 +348,34 @@ class TestTraining:
         for folder in (tmp_path / "out", tmp_path / "alone"):
             policy = (folder / "policy.safetensors").read_bytes()
             assert policy == (folder / f"seed_{best}" / "policy.safetensors").read_bytes()
+
+    def test_a_level_is_added_when_few_enough_episodes_fail(self):
+        from baselines.training.curve import TrainingProgress
+        from baselines.training.model import make_envs
+        from baselines.training.train import raise_level, set_level
+        from tlf_env import EndReason
+
+        config = load_config({**CONFIG, "formations": 40, "curriculum": {"failed_share": 0.1}})
+        envs, done = make_envs(config, 1), TrainingProgress()
+        set_level(envs, config, done)
+
+        def drawn() -> set[float]:
+            envs.reset()
+            levels = [one.disturbance.level for one in envs.get_attr("scenario")]
+            return set(levels)
+
+        assert drawn() == {0.5}
+        for ends, count in (
+            ([EndReason.HORIZON] * 99, 1),  # too few
+            ([EndReason.HORIZON] * 89 + [EndReason.LOST] * 11, 1),
+            ([EndReason.HORIZON] * 90 + [EndReason.OTHER_ROBOT] * 10, 2),
+            ([EndReason.HORIZON] * 100, 2),  # there is no further level
+        ):
+            envs.last_ends.clear()
+            envs.last_ends.extend(ends)
+            raise_level(envs, config, done)
+            assert done.level_count == count
+        assert drawn() == {0.5, 1.0}
 
     @pytest.mark.slow
     def test_from_nothing_it_learns_to_follow(self, tmp_path):

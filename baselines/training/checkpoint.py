@@ -43,6 +43,7 @@ def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, notes: dict[
         "action_generator": model.action_space.np_random.bit_generator.state,
         "parameters": _without_tensors(model.get_parameters(), "model", tensors),
         "memory": _without_tensors(_memory(model), "memory", tensors),
+        "last_ends": list(envs.last_ends),
     }
     for i, plant in enumerate(envs.plants):
         for name, array in plant.arrays._asdict().items():
@@ -72,6 +73,7 @@ def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, 
             for name, array in plant.arrays._asdict().items():
                 array[...] = tensors[f"plant.{i}.{name}"].numpy()
             plant._seeded[:] = True
+        envs.last_ends.extend(plain["last_ends"])
         kind, *rest = plain["numpy_generator"]
         keys = tensors["numpy_generator"].numpy()
         np.random.set_state((kind, keys, *rest))  # noqa: NPY002 - SB3 draws from it

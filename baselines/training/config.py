@@ -44,6 +44,13 @@ class ImitationConfig(Frozen):
     learning_rate: Positive = 1e-3
 
 
+class CurriculumConfig(Frozen):
+    """The levels one after another: an episode draws one of those that were reached so far."""
+
+    failed_share: Annotated[Number, Field(ge=0, lt=1)] = 0.05
+    # The next level is added when at most this share of the last 100 robots' episodes ended before the horizon.
+
+
 class EvaluationConfig(Frozen):
     """Evaluation on choosing seeds, which decides which policy is kept."""
 
@@ -77,6 +84,7 @@ class TrainConfig(Frozen):
         dict[str, NonNegative], Field(min_length=1)
     ]  # preset or file: share of episodes
     levels: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)  # with equal shares
+    curriculum: CurriculumConfig | None = None  # None: all levels from the start
     checkpoint_every: Count = 1_000_000  # robot steps
     evaluation: EvaluationConfig
 
@@ -90,6 +98,12 @@ class TrainConfig(Frozen):
             )
         if self.imitation is not None and self.algorithm != "PPO":
             raise ValueError(f"imitation needs algorithm PPO, got {self.algorithm}")
+        if self.curriculum is not None and (
+            len(self.levels) < 2 or list(self.levels) != sorted(set(self.levels))
+        ):
+            raise ValueError(
+                f"curriculum needs at least two levels that increase, got levels {list(self.levels)}"
+            )
         if not any(self.disturbances.values()):
             raise ValueError("disturbances: at least one share must be above 0")
         for reserved in ("seed", "policy", "env", "policy_kwargs", "tensorboard_log", "use_sde"):
@@ -105,6 +119,16 @@ class TrainConfig(Frozen):
         self.evaluation_scenarios()
         return self
 
+    def shares(self, level_count: int | None = None) -> list[float]:
+        """Shares of episodes of each disturbance at each level, with the first levels only, all if None."""
+        count = len(self.levels) if level_count is None else level_count
+        return [
+            share if number < count else 0.0
+            for share in self.disturbances.values()
+            if share > 0
+            for number in range(len(self.levels))
+        ]
+
     def mixture(self) -> tuple[dict[str, list[Scenario]], list[float]]:
         """Scenarios of each task (every disturbance at every level), and their shares of episodes.
 
@@ -114,15 +138,14 @@ class TrainConfig(Frozen):
             for an invalid scenario, one that cannot run in a batch, or one that must not train
             (:mod:`baselines.runs.splits`).
         """
-        wanted = {name: share for name, share in self.disturbances.items() if share > 0}
-        shares = [share for share in wanted.values() for _ in self.levels]
+        wanted = [name for name, share in self.disturbances.items() if share > 0]
         tasks = {
             task: [self._scenario(task, name, level) for name in wanted for level in self.levels]
             for task in self.tasks
         }
         for scenario in itertools.chain.from_iterable(tasks.values()):
             check_training(scenario)
-        return tasks, shares
+        return tasks, self.shares()
 
     def evaluation_scenarios(self) -> dict[tuple[str, str], Scenario]:
         """Scenario of each task and disturbance of the evaluation.

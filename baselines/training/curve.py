@@ -22,6 +22,7 @@ class TrainingProgress:
     wall_time_s: float = 0.0
     rollouts: list[dict[str, float]] = field(default_factory=list)
     evaluations: list[dict[str, Any]] = field(default_factory=list)
+    level_count: int = 1  # levels of the curriculum reached so far, the first of them included
 
 
 def write_curve(

@@ -23,6 +23,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from baselines.runs.jobs import alone_in, claim
 from baselines.runs.provenance import simulation_digest
+from baselines.sb3 import FormationVecEnv
 from baselines.training.checkpoint import read_checkpoint, write_checkpoint
 from baselines.training.config import TrainConfig
 from baselines.training.curve import TrainingProgress, write_curve
@@ -104,8 +105,10 @@ def _train(
     model.set_logger(Logger(str(folder), tensorboard(folder)))
     if (folder / CHECKPOINT_FILE).exists():
         done = TrainingProgress(**read_checkpoint(folder / CHECKPOINT_FILE, model, envs))
+        set_level(envs, config, done)
     else:
         done = TrainingProgress()
+        set_level(envs, config, done)
         spread_out(model, envs, config.seeds[0])
         if config.imitation is not None:
             imitate(model, envs, config)
@@ -118,6 +121,7 @@ def _train(
             model.learn(rollout_steps(model), reset_num_timesteps=False, log_interval=None)
             now, last = model.num_timesteps, model.num_timesteps >= config.robot_steps
             record_rollout(model, done)
+            raise_level(envs, config, done)
             if last or passed(config.evaluation.every, before, now):
                 evaluate_and_keep(model, config, seed, folder, done, command)
             done.wall_time_s = time.perf_counter() - began
@@ -137,6 +141,24 @@ def passed(every: int, before: int, now: int) -> bool:
     return now // every > before // every
 
 
+def set_level(envs: FormationVecEnv, config: TrainConfig, done: TrainingProgress) -> None:
+    """Let episodes draw the levels of the curriculum that were reached."""
+    if config.curriculum is not None:
+        envs.set_shares(config.shares(done.level_count))
+
+
+def raise_level(envs: FormationVecEnv, config: TrainConfig, done: TrainingProgress) -> None:
+    """Add the next level of the curriculum if few enough of the last episodes failed."""
+    if config.curriculum is None or done.level_count == len(config.levels):
+        return
+    counted = len(envs.last_ends) == envs.last_ends.maxlen
+    failed_share = 1.0 - envs.end_shares()["horizon"]
+    if counted and failed_share <= config.curriculum.failed_share:
+        done.level_count += 1
+        set_level(envs, config, done)
+        envs.last_ends.clear()
+
+
 def record_rollout(model: Any, done: TrainingProgress) -> None:
     """Record a rollout and its update for TensorBoard and ``curve.json``."""
     buffer = getattr(model, "rollout_buffer", None)
@@ -149,6 +171,7 @@ def record_rollout(model: Any, done: TrainingProgress) -> None:
             }
         )
         model.logger.record("rollout/mean_reward", done.rollouts[-1]["mean_reward"])
+    model.logger.record("curriculum/level_count", done.level_count)
     for reason, share in model.get_env().end_shares().items():
         model.logger.record(f"ends/{reason}", share)
     model.logger.dump(model.num_timesteps)

@@ -181,6 +181,30 @@ class BatchPlant:
         self.arrays = self.arrays._replace(tables=np.array(tables))
         self.arrays.routes[:] = np.where(phases_s == 0.0, 0, 1 + np.searchsorted(later, phases_s))
 
+    def set_shares(self, mixture: bool | Sequence[float]) -> None:
+        """Give the scenarios of a mixture other shares, for the episodes that begin from now on.
+
+        Parameters
+        ----------
+        mixture
+            As for the constructor, True or a share for each scenario; at least 0.
+
+        Raises
+        ------
+        ValueError
+            for a plant that was made without ``mixture``, or wrong shares.
+        """
+        summed = self._variants.mixture
+        if not len(summed):
+            raise ValueError(
+                "shares need a plant with a mixture; give mixture=True when it is made"
+            )
+        if mixture is False:
+            raise ValueError(f"mixture False must be True or {len(summed)} shares")
+        shares = np.array(_shares(mixture, len(summed)))
+        summed[:] = np.cumsum(shares)
+        summed[np.flatnonzero(shares)[-1] :] = 1.0  # so that rounding draws none with a share of 0
+
     def check_reset(
         self, seed: int | Sequence[int | None] | None, mask: np.ndarray | None
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
