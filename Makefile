@@ -35,7 +35,8 @@ test-slow: $(VENV)/.stamp-test ## Run the slow tests
 	$(BIN)/pytest -m slow
 
 test-learning: $(VENV)/.stamp-train ## Run the tests that need stable-baselines3 and torch
-	$(BIN)/pytest tests/test_sb3.py tests/test_learned.py tests/test_examples.py tests/test_gymnasium.py
+	$(BIN)/pytest tests/test_sb3.py tests/test_learned.py tests/test_learners.py tests/test_doors.py tests/test_train.py \
+		tests/test_examples.py tests/test_gymnasium.py
 
 check: $(VENV)/.stamp-test ## Lint, check format and types
 	$(BIN)/ruff check

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 import signal
 
+import gymnasium
 import numpy as np
 import pytest
 
@@ -302,3 +303,58 @@ def test_normalise_monitor_and_evaluate(tmp_path):
     assert len(model.ep_info_buffer) > 0
     mean, _ = evaluate_policy(model, env, n_eval_episodes=4)
     assert np.isfinite(mean)
+
+
+# Learning from nothing, as the README shows it
+
+
+def played(model: PPO, seeds: range) -> list[tuple[float, int]]:
+    """Return and end of an episode of 60 s for each seed, deterministic."""
+    env = gymnasium.make("tlf_env/Infinity-v0", horizon_s=60.0, infos=("end",))
+    found = []
+    for seed in seeds:
+        seen, _ = env.reset(seed=seed)
+        total, over = 0.0, False
+        while not over:
+            seen, reward, terminated, truncated, info = env.step(
+                model.predict(seen, deterministic=True)[0]
+            )
+            total, over = total + float(reward), terminated or truncated
+        found.append((total, int(info["end"])))
+    return found
+
+
+@pytest.mark.slow
+def test_ppo_with_its_defaults_learns_from_nothing():
+    """One robot that follows the default system. Before, it is lost; it takes two minutes."""
+    model = PPO(
+        "MlpPolicy", gymnasium.make("tlf_env/Infinity-v0", infos=False), seed=0, device="cpu"
+    )
+    seeds = range(10_000, 10_005)
+    before = played(model, seeds)
+    model.learn(200_000)
+    after = played(model, seeds)
+    assert {end for _, end in before} == {EndReason.LOST}
+    assert {end for _, end in after} == {EndReason.HORIZON}
+    assert min(one for one, _ in after) > 2.0 * max(one for one, _ in before)
+
+
+@pytest.mark.slow
+def test_all_robots_learn_from_nothing_with_the_defaults_of_ppo():
+    """The README's snippet, with a quarter of its steps; it takes a minute."""
+    envs = FormationVecEnv("infinity", formations=32, staggered=True, infos=False)
+    model = PPO("MlpPolicy", envs, n_steps=128, batch_size=512, seed=0, device="cpu")
+    judge = FormationVecEnv("infinity", formations=10, horizon_s=60.0)
+
+    def ends() -> set[int]:
+        judge.seed(10_000)
+        seen, found = judge.reset(), {}
+        while len(found) < judge.num_envs:
+            seen, _, dones, infos = judge.step(model.predict(seen, deterministic=True)[0])
+            for i in np.flatnonzero(dones):
+                found.setdefault(int(i), infos[i]["end"])
+        return set(found.values())
+
+    assert EndReason.HORIZON not in ends()
+    model.learn(500_000)
+    assert ends() == {EndReason.HORIZON}
