@@ -109,6 +109,22 @@ def test_a_wrong_config_is_reported_in_one_line(changes: dict, said: str):
     assert "\n" not in str(error.value)
 
 
+def test_a_disturbance_may_have_a_level_of_its_own():
+    tasks, shares = load_config(
+        {**CONFIG, "disturbances": {"ice@1.3": 2, "slip": 1}, "levels": [0.5, 1.0]}
+    ).mixture()
+    drawn = [(one.disturbance.name, one.disturbance.level) for one in tasks["infinity"]]
+    assert drawn == [("ice", 0.65), ("ice", 1.3), ("slip", 0.5), ("slip", 1.0)]
+    assert shares == [2, 2, 1, 1]
+    evaluated = load_config(
+        {**CONFIG, "evaluation": {**CONFIG["evaluation"], "disturbances": ["ice@1.3"]}}
+    ).evaluation_scenarios()
+    assert {one.disturbance.level for one in evaluated.values()} == {1.3}
+    assert set(evaluated) == {("infinity", "ice@1.3"), ("flower", "ice@1.3")}
+    with pytest.raises(ValueError, match=re.escape("'ice@much' is not one of")):
+        load_config({**CONFIG, "disturbances": {"ice@much": 1}})
+
+
 def test_presets_have_names():
     assert load_config("quick") == load_config(presets_folder("training") / "quick.yaml")
     with pytest.raises(ValueError, match="training 'quickly' is not one of curriculum, direct"):
@@ -233,7 +249,7 @@ class TestTraining:
 
         from baselines import ReferencePolicy
         from baselines.training.imitation import imitate
-        from baselines.training.model import make_envs, make_model, begin
+        from baselines.training.model import begin, make_envs, make_model
 
         fields = {**SHORT, "horizon_s": 10.0, "action": "twist", "estimator": "ekf-slip"}
         config = load_config(

@@ -82,7 +82,7 @@ class TrainConfig(Frozen):
     ]  # task: its own scenario fields
     disturbances: Annotated[
         dict[str, NonNegative], Field(min_length=1)
-    ]  # preset or file: share of episodes
+    ]  # preset or file: share of episodes; also PRESET@LEVEL, as ice@1.3
     levels: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)  # with equal shares
     curriculum: CurriculumConfig | None = None  # None: all levels from the start
     checkpoint_every: Count = 1_000_000  # robot steps
@@ -178,6 +178,9 @@ class TrainConfig(Frozen):
     def _scenario(self, task: str, disturbance: str, level: float | None, **more: Any) -> Scenario:
         """A task's scenario; an error names the place of the key in the configuration."""
         own = self.tasks[task]
+        disturbance, own_level = level_of(disturbance)
+        if own_level is not None:
+            level = own_level if level is None else own_level * level
         fields = {**self.scenario, "plant": "batch", **own, **more, "disturbance": disturbance}
         try:
             return scenario_with(task, fields, level)
@@ -185,6 +188,15 @@ class TrainConfig(Frozen):
             key = re.split(r"[.:\s]", str(error), maxsplit=1)[0]
             place = f"tasks.{task}." if key in own else "scenario." if key in self.scenario else ""
             raise ValueError(f"{place}{error}") from error
+
+
+def level_of(disturbance: str) -> tuple[str, float | None]:
+    """The disturbance and the level of ``PRESET@LEVEL``; None without a level."""
+    name, found, level = disturbance.rpartition("@")
+    try:
+        return (name, float(level)) if found else (disturbance, None)
+    except ValueError:
+        return disturbance, None
 
 
 def _place_disturbances(data: dict[str, Any], folder: Path) -> None:
