@@ -32,7 +32,8 @@ def test_the_page_is_that_of_the_cells():
 
 
 def test_the_cells_are_those_of_the_plan():
-    plans = [read_plan(name, PLAN_OPTIONS) for name in ("crossing", "crossing-slow")]
+    names = ("crossing", "crossing-slow", "crossing-moving-horizon")
+    plans = [read_plan(name, PLAN_OPTIONS) for name in names]
     wanted = {
         (policy, disturbance)
         for plan in plans
@@ -41,7 +42,8 @@ def test_the_cells_are_those_of_the_plan():
     }
     assert {(cell["policy"], cell["disturbance"]) for cell in CELLS} == wanted
     for cell in CELLS:
-        assert cell["runs"] >= (16 if cell["policy"].startswith("nmpc") else 100)
+        slow = "nmpc" in cell["policy"] or "moving-horizon" in cell["policy"]
+        assert cell["runs"] >= (16 if slow else 100)
 
 
 @pytest.mark.parametrize("line", LINES, ids=lambda line: f"{line['policy']} {line['disturbance']}")
@@ -101,6 +103,26 @@ def test_results_make_the_page_twice_alike(results, tmp_path):
     make_crossing.write_crossing([results], tmp_path)
     assert page.read_text() == made
     assert len((tmp_path / "docs" / make_crossing.SLICE).read_text().splitlines()) == 1
+
+
+def test_results_are_added_to_those_of_other_systems(results, tmp_path):
+    (tmp_path / "docs" / "crossing").mkdir(parents=True)
+    page = tmp_path / "docs" / make_crossing.PAGE
+    marks = "".join(f"<!-- {one} -->\nold\n<!-- end of {one} -->\n" for one in ("ekf", "truth"))
+    page.write_text(marks)
+    other = {**cell(1, 5.0), "policy": "lqr+truth+none", "disturbance": "nominal"}
+    mine = {**cell(0, 7.0), "policy": "kanayama+ekf+none", "disturbance": "nominal"}
+    both = [one | {"disturbance": name} for one in (other, mine) for name in ("nominal", "ice")]
+    (tmp_path / "docs" / make_crossing.CELLS).write_text(json.dumps(both))
+    (tmp_path / "docs" / make_crossing.SLICE).write_text('{"policy": "lqr+truth+none"}\n')
+    make_crossing.write_crossing([results], tmp_path, add=True)
+    cells = json.loads((tmp_path / "docs" / make_crossing.CELLS).read_text())
+    assert cells[:2] == both[:2]
+    assert len(cells) == 6
+    assert {one["median_mm"] for one in cells if one["policy"] == "kanayama+ekf+none"} != {7.0}
+    lines = (tmp_path / "docs" / make_crossing.SLICE).read_text().splitlines()
+    assert [json.loads(one)["policy"].split("+")[0] for one in lines] == ["lqr", "kanayama"]
+    assert "| `lqr` | `none` | 100 | 5.00 [4.50, 6.00] (1) |" in page.read_text()
 
 
 def test_a_page_without_markers_is_refused_and_nothing_is_written(results, tmp_path):

@@ -3,8 +3,8 @@
 First run ``tlf bench --plan crossing --no-figures --out results/crossing``. Then
 ``python docs/figures/make_crossing.py results/crossing`` keeps the cells in ``docs/crossing/cells.json``, and
 one run of each controller, which a test runs again, in ``docs/crossing/slice.jsonl``. Results of the plan
-``crossing-slow`` may follow as a second folder. The same results give the same files. This needs the extra
-``bench``.
+``crossing-slow`` may follow as a second folder. With ``--add`` the systems that are not in the new results
+stay as they are. The same results give the same files. This needs the extra ``bench``.
 """
 
 from __future__ import annotations
@@ -100,25 +100,32 @@ def slice_of(lines: list[Line]) -> list[Line]:
     return [mine[7 * k % len(mine)] for k, mine in enumerate(runs.values())]
 
 
-def write_crossing(folders: list[Path], root: Path = ROOT) -> None:
-    """Write page, cells and slice under ``root``, the checkout.
+def write_crossing(folders: list[Path], root: Path = ROOT, *, add: bool = False) -> None:
+    """Write page, cells and slice under ``root``, the checkout; with ``add``, beside what is there.
 
     Raises
     ------
     ValueError
         for results that are not complete, or are of other disturbances, before any file is written.
     """
+    docs = root / DOCS.name
     cells: list[Cell] = []
     lines: list[Line] = []
     shared: tuple[str, ...] = ()
+    if add:
+        cells = json.loads((docs / CELLS).read_text("utf-8"))
+        lines = [json.loads(one) for one in (docs / SLICE).read_text("utf-8").splitlines()]
+        shared = tuple(dict.fromkeys(cell["disturbance"] for cell in cells))
     for folder in folders:
         board, found = read_results(folder, "crossing")
         shared = shared or plan_of(board).disturbances
         if plan_of(board).disturbances != shared:
             raise ValueError(f"{folder} has other disturbances than {folders[0]}")
+        new = {cell["policy"] for cell in board["cells"]}
+        cells = [cell for cell in cells if cell["policy"] not in new]
         cells += map(kept, board["cells"])
-        lines += slice_of(found)
-    docs = root / DOCS.name
+        drawn = {line["policy"].partition("+")[0] for line in lines}
+        lines += [one for one in slice_of(found) if one["policy"].partition("+")[0] not in drawn]
     page = page_of((docs / PAGE).read_text("utf-8"), cells)
     (docs / CELLS).parent.mkdir(exist_ok=True)
     write_text(docs / CELLS, "[\n" + ",\n".join(json.dumps(cell) for cell in cells) + "\n]\n")
@@ -130,8 +137,10 @@ def main() -> None:
     """Run the command line."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").splitlines()[0])
     parser.add_argument("results", type=Path, nargs="+", help="output folders of tlf bench")
+    parser.add_argument("--add", action="store_true", help="keep the other systems of the page")
+    given = parser.parse_args()
     try:
-        write_crossing(parser.parse_args().results)
+        write_crossing(given.results, add=given.add)
     except ValueError as error:
         sys.exit(f"make_crossing: {error}")
 
