@@ -82,13 +82,10 @@ def least_reward(weights: Mapping[str, float], lost_beyond_mm: float) -> tuple[f
     depends on its error alone, 0 to ``lost_beyond_mm``. If the smallest is negative, being lost may be the
     best choice: it costs ``lost`` once, driving on this much in every step.
     """
-    errors_mm = np.append(np.geomspace(0.01, lost_beyond_mm, 1000), 0.0)
-    rewards = (
-        weights["alive"]
-        + weights["far"] * errors_mm / FAR_MM
-        + weights["coarse"] * np.exp(-errors_mm / 100.0)
-        + weights["medium"] * np.exp(-errors_mm / 10.0)
-        + weights["fine"] * np.exp(-errors_mm / 2.0)
-    )
-    worst = int(np.argmin(rewards))
-    return float(rewards[worst]), float(errors_mm[worst])
+    terms_of = getattr(reward_terms, "py_func", reward_terms)  # without compiling it for Python
+    errors_mm = (0.0, *np.geomspace(0.01, lost_beyond_mm, 200).tolist())
+    rewards = [
+        sum(weights[name] * value for name, value in terms._asdict().items())
+        for terms in (terms_of(error, 0.0, 0.0, 0.0, False, False) for error in errors_mm)
+    ]
+    return min(zip(rewards, errors_mm, strict=True))
