@@ -1,8 +1,8 @@
 """SB3's PPO on many formations at once: a starting point for your own training.
 
 Every robot of every formation is a sub-environment, and one policy is trained for all of them. Its action
-is a *residual*: it is added to the twist of the tuned reference, before the limits of that reference, so
-the initial policy is close to the reference. The default trains for a few seconds, as a check; a million
+is a *residual*: it is added to the twist of the default controller, before its limits, so the initial policy
+is close to that controller. The default trains for a few seconds, as a check; a million
 robot steps take about two minutes. The policy is written in the format of ``tlf run --policy``, which does
 not need torch.
 

@@ -21,7 +21,11 @@ from tlf_env.envs.single import FormationEnv
 EXAMPLES = Path(__file__).resolve().parent.parent / "examples"
 SCRIPTS = sorted(path.stem for path in EXAMPLES.glob("*.py"))
 FILES = sorted(path.stem for path in EXAMPLES.glob("*.yaml"))
-NEEDS = {"linear_design": "control", "train_ppo": "stable_baselines3"}
+NEEDS = {
+    "learn_to_follow": "stable_baselines3",
+    "linear_design": "control",
+    "train_ppo": "stable_baselines3",
+}
 
 every_script = pytest.mark.parametrize("name", SCRIPTS)
 
@@ -35,7 +39,7 @@ def example(name: str, monkeypatch: pytest.MonkeyPatch) -> ModuleType:
 
 
 def test_there_is_something_to_run() -> None:
-    assert len(SCRIPTS) == 14
+    assert len(SCRIPTS) == 15
     assert FILES == ["mixed_formation", "own_robot"]
 
 
@@ -120,6 +124,17 @@ def test_training_runs_and_saves(
     example.main(robot_steps=400, formations=4, horizon_s=5.0, out=out)
     assert "reference" in capsys.readouterr().out
     assert load_policy(out).card.residual_base == "linearised"
+
+
+@pytest.mark.parametrize("name", ["learn_to_follow"])
+def test_learning_is_judged_before_and_after(
+    example: ModuleType, capsys: pytest.CaptureFixture[str]
+) -> None:
+    example.main(steps=100, episodes=2, horizon_s=4.0)
+    before, after = capsys.readouterr().out.splitlines()
+    assert before.startswith("before: mean return")
+    assert after.startswith("after: mean return")
+    assert "held 2 of 2" in before
 
 
 # What the parts of the examples are worth, on the whole task
