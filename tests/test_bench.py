@@ -359,7 +359,10 @@ def test_seeds_of_another_form_are_reported(text):
         ("--level -1", "level"),
         ("--horizon-s 0.03", "horizon_s"),
         ("--processes -1", "processes"),
-        ("--plan no_such", "not one of board, controllers, crossing, crossing-slow, unseen, nor"),
+        (
+            "--plan no_such",
+            "not one of board, controllers, crossing, crossing-moving-horizon, crossing-slow, ",
+        ),
         ("--plan no_such.yaml", "no_such.yaml"),
         ("--plan trusting.yaml", "'trust'"),
         ("--plan nested.yaml", "seeds must be a text, a number or a list"),
