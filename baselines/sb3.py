@@ -127,6 +127,11 @@ class FormationVecEnv(VecEnv):
         self._lengths = np.zeros(self.num_envs, dtype=np.int64)
         self.last_ends: deque[int] = deque(maxlen=ENDS_KEPT)  # of robots, as in EndReason
 
+    def clear_statistics(self) -> None:
+        """Count the running episodes from now on, and forget how others ended."""
+        self._returns[:], self._lengths[:] = 0.0, 0
+        self.last_ends.clear()
+
     def end_shares(self) -> dict[str, float]:
         """How the last 100 episodes of robots ended: the share of each :class:`~tlf_env.EndReason`.
 

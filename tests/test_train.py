@@ -249,7 +249,7 @@ class TestTraining:
 
         from baselines import ReferencePolicy
         from baselines.training.imitation import imitate
-        from baselines.training.model import begin, make_envs, make_model
+        from baselines.training.model import make_envs, make_model, spread_out
 
         fields = {**SHORT, "horizon_s": 10.0, "action": "twist", "estimator": "ekf-slip"}
         config = load_config(
@@ -262,7 +262,7 @@ class TestTraining:
         )
         envs = make_envs(config, 1)
         model = make_model(config, envs, 0)
-        begin(model, envs, 0)
+        spread_out(model, envs, 0)
         imitate(model, envs, config)
         seen = envs.observations()
         meant = ReferencePolicy("tuned", preview_s=(0.5,)).predict(seen)[0]

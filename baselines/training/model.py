@@ -28,12 +28,7 @@ def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
     tasks, shares = config.mixture()
     with without_warnings():
         envs = FormationVecEnv(
-            tasks,
-            config.formations,
-            mixture=shares,
-            staggered=True,
-            threads=threads,
-            infos=False,
+            tasks, config.formations, mixture=shares, threads=threads, infos=False
         )
     first, end = config.seeds
     if end - first < config.formations:
@@ -95,10 +90,27 @@ def algorithm(config: TrainConfig) -> tuple[Callable[..., Any], str]:
     return RecurrentPPO, "MlpLstmPolicy"
 
 
-def begin(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
-    """Start the first episodes, formation k with ``first_seed`` + k."""
+def spread_out(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
+    """Bring the formations to different moments of their episodes, as they are later in a training.
+
+    Otherwise all of them would start at once, and the first rollouts would contain starts only.
+    """
     envs.seed(first_seed)
-    model._last_obs = envs.reset()
+    seen = envs.reset()
+    longest = max(plant.scenario.horizon_steps for plant in envs.plants)
+    begin = [
+        longest - (np.arange(plant.formations) * plant.scenario.horizon_steps) // plant.formations
+        for plant in envs.plants
+    ]
+    state, starts = None, np.ones(envs.num_envs, dtype=np.bool_)
+    for step in range(longest):
+        actions, state = model.predict(seen, state, starts, deterministic=True)
+        seen, _, starts, _ = envs.step(actions)
+        for plant, moments in zip(envs.plants, begin, strict=True):
+            if (moments == step).any():
+                plant.reset(mask=moments == step)
+    envs.clear_statistics()
+    model._last_obs = envs.observations()
     model._last_episode_starts = np.ones(envs.num_envs, dtype=np.bool_)
 
 

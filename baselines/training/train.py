@@ -2,8 +2,8 @@
 
     tlf train residual --seeds 0,1,2
 
-One call of :func:`train` is one seed. It makes environments and a model, and then alternates rollouts and
-updates; the first episodes end at different times. At intervals the policy is evaluated on choosing
+One call of :func:`train` is one seed. It makes environments and a model, spreads the formations over
+their episodes, and then alternates rollouts and updates. At intervals the policy is evaluated on choosing
 seeds; ``policy.safetensors`` holds the best one so far. ``curve.json`` records the course of the training.
 """
 
@@ -30,11 +30,11 @@ from baselines.training.curve import TrainingProgress, write_curve
 from baselines.training.export import export_policy
 from baselines.training.imitation import imitate
 from baselines.training.model import (
-    begin,
     make_envs,
     make_model,
     rollout_steps,
     set_learning_rate,
+    spread_out,
 )
 from baselines.training.scoring import overall_mm, score_policy
 from tlf_env.task.neutral import scenario_hash
@@ -109,7 +109,7 @@ def _train(
     else:
         done = TrainingProgress()
         set_level(envs, config, done)
-        begin(model, envs, config.seeds[0])
+        spread_out(model, envs, config.seeds[0])
         if config.imitation is not None:
             imitate(model, envs, config)
         evaluate_and_keep(model, config, seed, folder, done, command)
