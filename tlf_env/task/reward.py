@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -78,14 +79,15 @@ def reward_terms(
 def least_reward(weights: Mapping[str, float], lost_beyond_mm: float) -> tuple[float, float]:
     """The smallest reward of a step that a robot cannot avoid, and its position error in mm.
 
-    A robot that is not lost can always have an action of zero, and wheels that do not slip; then its reward
-    depends on its error alone, 0 to ``lost_beyond_mm``. If the smallest is negative, being lost may be the
-    best choice: it costs ``lost`` once, driving on this much in every step.
+    A robot that is not lost can always have an action of zero, and wheels that do not slip; then all
+    arguments of the terms are 0 but its error, 0 to ``lost_beyond_mm``. If the smallest is negative, being
+    lost may be the best choice: it costs ``lost`` once, driving on this much in every step.
     """
-    terms_of = getattr(reward_terms, "py_func", reward_terms)  # without compiling it for Python
+    terms_of: Any = getattr(reward_terms, "py_func", reward_terms)  # not compiled for Python
+    avoided = [0] * (len(inspect.signature(terms_of).parameters) - 1)
     errors_mm = (0.0, *np.geomspace(0.01, lost_beyond_mm, 200).tolist())
     rewards = [
         sum(weights[name] * value for name, value in terms._asdict().items())
-        for terms in (terms_of(error, 0.0, 0.0, 0.0, False, False) for error in errors_mm)
+        for terms in (terms_of(error, *avoided) for error in errors_mm)
     ]
     return min(zip(rewards, errors_mm, strict=True))
