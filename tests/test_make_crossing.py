@@ -32,7 +32,7 @@ def test_the_page_is_that_of_the_cells():
 
 
 def test_the_cells_are_those_of_the_plan():
-    names = ("crossing", "crossing-slow")
+    names = ("crossing", "crossing-slow", "crossing-moving-horizon")
     plans = [read_plan(name, PLAN_OPTIONS) for name in names]
     wanted = {
         (policy, disturbance)
