@@ -74,13 +74,17 @@ def test_an_unknown_scenario_is_named(door):
         door("infinitx")
 
 
-def test_of_several_scenarios_the_first_decides():
-    several = [load_scenario("infinity", action="residual"), {"action": "residual"}]
-    several[1] |= {"trajectory": load_scenario("infinity").trajectory.model_dump()}
-    assert (
-        vector([several[0], load_scenario("infinity", action="residual")]).scenario.action
-        == "residual"
-    )
+def test_of_several_scenarios_one_that_says_its_action_is_enough():
+    """Then the others must agree: nothing that is given is replaced."""
+    plain = {"trajectory": load_scenario("infinity").trajectory.model_dump(), "name": "infinity"}
+    assert vector([plain, "infinity"]).scenario.action == "tracking_twist"
+    assert vector([plain, load_scenario(plain)]).scenario.action == "twist"
+    for several in (
+        [plain, {**plain, "action": "residual"}],
+        [{**plain, "action": "residual"}, plain],
+    ):
+        with pytest.raises(ValueError, match=r"scenario 1: action is '(residual|twist)'"):
+            vector(several)
     with pytest.raises(ValueError, match="empty"):
         vector([])
 

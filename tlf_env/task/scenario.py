@@ -559,23 +559,29 @@ def load_scenario(
 def learners_action(source: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
     """The overrides with the action that learners have by default, if nothing says which.
 
-    A :class:`Scenario` is complete: its action stays. Of several sources the first decides.
+    A :class:`Scenario` is complete: its action stays. ``source`` may be a sequence; one that says its action
+    is enough.
 
     Raises
     ------
     ValueError
         for an unknown preset, or a file that cannot be read.
     """
-    if isinstance(source, Sequence) and not isinstance(source, str):
-        source = next(iter(source), {})
-    if overrides.get("action") is not None or isinstance(source, Scenario):
-        return dict(overrides)
-    given = source
-    if not isinstance(source, Mapping):
-        given = _read_source(source, overrides.get("control_period_s"))
-    if given.get("action") is not None:
+    several = isinstance(source, Sequence) and not isinstance(source, str)
+    period_s = overrides.get("control_period_s")
+    if overrides.get("action") is not None or any(
+        _names_action(one, period_s) for one in (source if several else [source])
+    ):
         return dict(overrides)
     return {**overrides, "action": LEARNERS_ACTION}
+
+
+def _names_action(source: Any, control_period_s: Any) -> bool:
+    """Whether a scenario says what its action is."""
+    if isinstance(source, Scenario):
+        return True
+    given = source if isinstance(source, Mapping) else _read_source(source, control_period_s)
+    return given.get("action") is not None
 
 
 def scenario_with(
