@@ -96,6 +96,7 @@ class FormationVecEnv(VecEnv):
             raise ValueError(
                 f"formations {formations!r} must be at least one for each of {len(tasks)} tasks"
             )
+        overrides = learners_action(tasks, overrides)  # of all together, which need the same
         shares = [len(part) for part in np.array_split(np.arange(formations), len(tasks))]
         self.plants = [
             BatchPlant(
@@ -104,7 +105,7 @@ class FormationVecEnv(VecEnv):
                 threads=threads,
                 mixture=mixture,
                 staggered=staggered,
-                **learners_action(task, overrides),
+                **overrides,
             )
             for task, share in zip(tasks, shares, strict=True)
         ]

@@ -89,6 +89,14 @@ def test_of_several_scenarios_one_that_says_its_action_is_enough():
         vector([])
 
 
+def test_tasks_of_one_environment_have_the_action_that_one_of_them_says():
+    plain = load_scenario("infinity").model_dump(exclude={"action"})
+    assert sb3({"a": "infinity", "b": [plain, "infinity"]}).scenario.action == "tracking_twist"
+    assert sb3({"a": "infinity", "b": [load_scenario("infinity")]}).scenario.action == "twist"
+    with pytest.raises(ValueError, match="'flower' has action 'twist', the first task 'residual'"):
+        sb3({"a": {**plain, "action": "residual"}, "b": "flower"})
+
+
 def test_all_agents_of_a_formation_command_twists_by_default():
     """The reference policies answer with twists."""
     assert tlf_env.parallel_env("infinity").scenario.action == "twist"

@@ -559,27 +559,27 @@ def load_scenario(
 def learners_action(source: Any, overrides: Mapping[str, Any]) -> dict[str, Any]:
     """The overrides with the action that learners have by default, if nothing says which.
 
-    A :class:`Scenario` is complete: its action stays. ``source`` may be a sequence; one that says its action
-    is enough.
+    A :class:`Scenario` is complete: its action stays. ``source`` may be a sequence, also of sequences; one
+    scenario that says its action is enough.
 
     Raises
     ------
     ValueError
         for an unknown preset, or a file that cannot be read.
     """
-    several = isinstance(source, Sequence) and not isinstance(source, str)
-    period_s = overrides.get("control_period_s")
-    if overrides.get("action") is not None or any(
-        _names_action(one, period_s) for one in (source if several else [source])
+    if overrides.get("action") is not None or _says_action(
+        source, overrides.get("control_period_s")
     ):
         return dict(overrides)
     return {**overrides, "action": LEARNERS_ACTION}
 
 
-def _names_action(source: Any, control_period_s: Any) -> bool:
-    """Whether a scenario says what its action is."""
+def _says_action(source: Any, control_period_s: Any) -> bool:
+    """Whether a scenario, or one of several, says what its action is."""
     if isinstance(source, Scenario):
         return True
+    if isinstance(source, Sequence) and not isinstance(source, str):
+        return any(_says_action(one, control_period_s) for one in source)
     given = source if isinstance(source, Mapping) else _read_source(source, control_period_s)
     return given.get("action") is not None
 
