@@ -157,6 +157,7 @@ class FormationVecEnv(VecEnv):
                 "observation",
                 "action",
                 "action_range",
+                "tracking_fade_mm",
                 "preview_s",
                 "rays",
                 "neighbour",

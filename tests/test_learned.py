@@ -403,15 +403,23 @@ def test_fade_and_reach_of_a_residual_belong_to_the_policy(tmp_path):
         make_policy(path, load_scenario(fading, residual_fade_mm=5.0))
 
 
-def test_range_and_limiter_of_an_action_belong_to_the_policy(tmp_path):
-    """Also the limiter that an action has where the scenario names none: what is usual may change."""
+def test_range_fade_and_limiter_of_an_action_belong_to_the_policy(tmp_path):
+    """Also those that an action has where the scenario names none: what is usual may change."""
     narrow = load_scenario(TWIST, action="tracking_twist", action_range=(60.0, 0.5))
     path = str(written(tmp_path, scenario=narrow))
     fitted = fit_policy(path, TWIST)
     assert fitted.scenario.action_entries == narrow.action_entries
-    assert fitted.scenario.limiter == narrow.action_limiter == load_limiter("grip")
+    assert fitted.scenario.limiter == narrow.action_limiter == load_limiter("approach")
+    assert fitted.scenario.tracking_fade_mm == 10.0 == narrow.action_fade_mm
     with pytest.raises(ValueError, match=r"action_scales \(60.0, 0.5\), the scenario has"):
         make_policy(path, load_scenario(fitted.scenario, action_range=(60.0, 1.0)))
+    with pytest.raises(ValueError, match=r"tracking_fade_mm 10.0, the scenario has 4.0"):
+        make_policy(path, load_scenario(fitted.scenario, tracking_fade_mm=4.0))
+    change_card(
+        Path(path), lambda card: {k: v for k, v in card.items() if k != "tracking_fade_mm"}
+    )  # a card from before there was this field
+    assert fit_policy(path, TWIST).scenario.tracking_fade_mm == 0.0
+    path = str(written(tmp_path, scenario=narrow))
     with pytest.raises(ValueError, match="it was trained with limiter"):
         make_policy(path, load_scenario(fitted.scenario, limiter="body"))
     free = str(written(tmp_path, scenario=load_scenario(narrow, limiter="none"), name="free"))

@@ -62,7 +62,8 @@ def test_zero_is_the_twist_of_the_reference():
 
 @pytest.mark.parametrize("range_", [None, (60.0, 0.5)])
 def test_the_range_is_what_one_means(range_):
-    formation = at_start(action="tracking_twist", limiter="none", action_range=range_)
+    fields = {"action": "tracking_twist", "limiter": "none", "action_range": range_}
+    formation = at_start(**fields, tracking_fade_mm=0.0)
     seen = formation.arrays.observations[0] * SCALES
     formation.arrays.actions[0] = [[1.0, 0.5], [-0.5, -1.0], [0.0, 0.25]]
     formation.step()
@@ -71,6 +72,24 @@ def test_the_range_is_what_one_means(range_):
     wanted = wanted + full * [[1.0, 0.5], [-0.5, -1.0], [0.0, 0.25]]
     np.testing.assert_allclose(commanded(formation), wanted.T, rtol=0, atol=1e-9)
     assert tuple(entry.scale for entry in formation.scenario.action_entries) == tuple(full)
+
+
+@pytest.mark.parametrize("fade_mm", [None, 40.0])
+def test_the_range_shrinks_towards_the_reference(fade_mm):
+    """By e/(e + F), with the estimated error that the observation has."""
+    fields = {"action": "tracking_twist", "limiter": "none", "disturbance": "start"}
+    formation = at_start(**fields, tracking_fade_mm=fade_mm)
+    for _ in range(50):
+        formation.step()
+    seen = formation.arrays.observations[0] * SCALES
+    error_mm = np.hypot(seen[:, place("e_1")], seen[:, place("e_2")])
+    assert error_mm[0] > 100.0
+    assert 0.01 < error_mm[1] < 100.0
+    formation.arrays.actions[0] = np.tile([1.0, -1.0], (3, 1))
+    formation.step()
+    added = commanded(formation) - seen[:, [place("reference_u_1"), place("reference_u_2")]].T
+    share = error_mm / (error_mm + (10.0 if fade_mm is None else fade_mm))
+    np.testing.assert_allclose(added, np.outer([100.0, -1.0], share), rtol=0, atol=1e-4)
 
 
 def test_the_range_of_a_residual_is_what_one_means():
@@ -96,6 +115,7 @@ def test_the_law_of_a_system_as_actions_is_the_system(limiter, disturbance, hori
     assert isinstance(fitted.policy, LimitedLaw)
     lead_s = load_limiter(limiter).lead_s
     asked = {"action": "tracking_twist", "action_range": (2000.0, 20.0), "limiter": limiter}
+    asked |= {"tracking_fade_mm": 0.0}
     whole, parts = Formation(fitted.scenario), Formation(load_scenario(fitted.scenario, **asked))
     entries = tracking_entries(scenario.preview_s, neighbour=scenario.neighbour)
     scales = np.array([entry.scale for entry in entries.values()])
@@ -167,7 +187,7 @@ def test_without_a_limiter_of_its_own_the_action_about_the_reference_has_the_usu
     assert usual.limiter is None
     assert usual.action_limiter == load_limiter(DEFAULT_LIMITER)
     blind = load_scenario("infinity", action="tracking_twist", preview_s=())
-    assert blind.action_limiter == GRIP.model_copy(update={"lead_s": 0.0})
+    assert blind.action_limiter == load_limiter(DEFAULT_LIMITER).model_copy(update={"lead_s": 0.0})
     for kind in ("twist", "wheel_speed", "torque", "residual"):
         assert load_scenario("infinity", action=kind).action_limiter == Limiter()
 
@@ -213,10 +233,15 @@ def test_all_doors_command_the_same():
             "action_range goes with the actions residual and tracking",
         ),
         ({"action": "tracking_twist", "action_range": (0.0, 1.0)}, "action_range"),
+        ({"action": "tracking_twist", "tracking_fade_mm": -1.0}, "tracking_fade_mm"),
+        (
+            {"tracking_fade_mm": 5.0},
+            "tracking_fade_mm goes with the action tracking_twist, not with",
+        ),
         ({"action": "tracking_twist", "action_range": 3.0}, "action_range"),
         ({"action": "torque", "limiter": "grip"}, "limiter goes with the actions twist, wheel_"),
         ({"action": "residual", "limiter": "grip"}, "limiter goes with the actions twist, wheel_"),
-        ({"limiter": "grid"}, r"'grid' is not one of body, grip, none"),
+        ({"limiter": "grid"}, r"'grid' is not one of approach, body, grip, none"),
         ({"limiter": {"limits": {"yaw_rate_rad_s": -1.0}}}, "limiter.limits.yaw_rate_rad_s"),
         ({"limiter": {"limits": {"lateral_error_mm": 5.0}}}, "belongs to a controller"),
         (

@@ -18,6 +18,7 @@ from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.limiter import (
     TwistLimits,
     braked,
+    closing_speed,
     limited_twist,
     saturated,
     speed_range,
@@ -155,6 +156,38 @@ def test_limits_are_the_same_to_the_left_and_to_the_right_and_back_and_forth(
         assert limited_twist(*mirrored, way * cruise, error, ALL) == (way * v_1, turn * v_2)
 
 
+GENTLE = twist_limits_row(
+    TwistLimits(closing_deceleration_mm_s2=50.0, closing_speed_mm_s=20.0), PERIOD_S
+)
+
+
+@untimed
+@given(speeds, st.floats(0, 700), st.floats(-1200, 1200))
+def test_the_approach_only_slows_down_and_never_below_the_references_speed(u_1, cruise, e_1):
+    v_1 = closing_speed(u_1, cruise, e_1, GENTLE)
+    assert v_1 <= u_1
+    assert v_1 == u_1 or v_1 >= cruise + 20.0
+    assert closing_speed(u_1, cruise, e_1, NONE) == u_1
+    assert closing_speed(u_1, cruise, -abs(e_1), GENTLE) == min(u_1, cruise + 20.0)
+
+
+@pytest.mark.parametrize("final_mm_s", [0.0, 20.0])
+def test_a_robot_that_approaches_as_fast_as_it_may_brakes_at_a_constant_rate(final_mm_s):
+    """From 300 mm behind: Δv² = 2·a·e, and the time that a constant deceleration takes."""
+    row = GENTLE._replace(closing_speed=final_mm_s)
+    behind_mm, time_s, dt_s = 300.0, 0.0, 1e-4
+    speeds_mm_s = []
+    while behind_mm > 1e-3:
+        speeds_mm_s.append(closing_speed(1e9, 400.0, behind_mm, row) - 400.0)
+        behind_mm -= speeds_mm_s[-1] * dt_s
+        time_s += dt_s
+    first = math.sqrt(final_mm_s**2 + 2 * 50.0 * 300.0)
+    assert speeds_mm_s[0] == pytest.approx(first)
+    assert time_s == pytest.approx((first - final_mm_s) / 50.0, rel=2e-2)
+    rates = -np.diff(speeds_mm_s[: int(0.9 * len(speeds_mm_s))]) / dt_s
+    np.testing.assert_allclose(rates, 50.0, rtol=2e-2)
+
+
 free = st.floats(-TUNED.free_speed_mm_s, TUNED.free_speed_mm_s)
 
 
@@ -237,7 +270,7 @@ def test_acceleration_at_the_lateral_limit_is_the_one_for_turns():
 @pytest.mark.parametrize("field", [name for name in TwistLimits.model_fields if "_mm" in name])
 @pytest.mark.parametrize("value", [0.0, -1.0, math.nan])
 def test_impossible_limits_are_refused(field, value):
-    if field in ("reverse_mm_s", "free_speed_mm_s") and value == 0.0:
+    if field in ("reverse_mm_s", "free_speed_mm_s", "closing_speed_mm_s") and value == 0.0:
         assert getattr(TwistLimits(**{field: value}), field) == 0.0
         return
     with pytest.raises(ValueError, match=field):

@@ -110,7 +110,7 @@ def test_a_path_with_a_plus_is_still_one_controller(tmp_path):
         ("kanayama+ekf+bodi", "limiter 'bodi' is not one of body, .*, FILE.yaml; did you mean"),
         (
             "kanayama+ekf+",
-            "limiter '' is not one of body, grip, none, supervised, yaw-rate, FILE",
+            "limiter '' is not one of approach, body, grip, none, supervised, yaw-rate, FILE",
         ),
         ("kanayama+ekf+body+none", r"limiter 'body\+none' is not one of"),
         ("kanayama+ekf+no_such.yaml", "cannot read no_such.yaml"),

@@ -46,6 +46,9 @@ class Card(Frozen):
     # What it was trained with, and has to be run with.
     action: ActionKind
     action_scales: tuple[Positive, Positive]  # value of 1.0: mm/s, rad/s, N·mm
+    tracking_fade_mm: NonNegative = (
+        0.0  # estimated error at which `tracking_twist` has half its range
+    )
     limiter: Limiter | None = None  # of the action's twist; None: it is not limited
     observation: Literal["tracking", "sensor"]
     entries: dict[str, Positive]  # that the policy takes, in its order, with their scales
@@ -175,6 +178,7 @@ def interface(scenario: Scenario) -> dict[str, Any]:
     return {
         "control_period_s": scenario.control_period_s,
         "action": scenario.action,
+        "tracking_fade_mm": scenario.action_fade_mm if scenario.action == "tracking_twist" else 0.0,
         "limiter": None if limiter == Limiter() else limiter,
         "residual_base": scenario.residual_base if residual else None,
         "residual_fade_mm": scenario.residual_fade_mm if residual else 0.0,

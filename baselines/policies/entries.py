@@ -36,6 +36,7 @@ class AskedFields(Frozen):
 
     action: ActionKind | None = None
     action_range: tuple[float, float] | None = None
+    tracking_fade_mm: float | None = None
     limiter: Limiter | None = None
     observation: Literal["tracking", "sensor"] | None = None
     estimator: str | None = None

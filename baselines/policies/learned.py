@@ -112,6 +112,8 @@ class LearnedPolicy:
         if card.residual_fade_mm:
             asked["residual_fade_mm"] = card.residual_fade_mm
         asked["residual_reach_mm"] = card.residual_reach_mm
+        if card.action == "tracking_twist":
+            asked["tracking_fade_mm"] = card.tracking_fade_mm
         if card.observation == "tracking":
             asked["preview_s"] = card.preview_s
         if card.action in RANGED_KINDS and card.action_scales != tuple(

@@ -36,6 +36,7 @@ from tlf_env.task.scenario import Scenario, load_scenario
 OVERRIDABLE = (
     "action",
     "action_range",
+    "tracking_fade_mm",
     "limiter",
     "observation",
     "residual_base",

@@ -8,6 +8,8 @@ pymunk plant calls :func:`actuate` and :func:`sense` one substep at a time while
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 
 from tlf_env.engine.arrays import (
@@ -115,7 +117,8 @@ def command(arrays: Arrays, lane: int, robot: int, settings: Settings) -> tuple[
         u_1, u_2 = given[0] * FULL_SPEED_MM_S, given[1] * FULL_YAW_RATE_RAD_S
     elif kind == TRACKING_TWIST:
         u_1, u_2 = led_reference(seen, arrays.scales, settings.limits.lead)
-        u_1, u_2 = u_1 + a_0 * settings.full_1, u_2 + a_1 * settings.full_2
+        share = residual_share(seen, arrays.scales, settings.tracking_fade, math.inf)
+        u_1, u_2 = u_1 + share * a_0 * settings.full_1, u_2 + share * a_1 * settings.full_2
     elif kind == LIMITED_TWIST:
         u_1, u_2 = a_0 * FULL_SPEED_MM_S, a_1 * FULL_YAW_RATE_RAD_S
     else:

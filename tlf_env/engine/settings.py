@@ -57,6 +57,7 @@ class Settings(NamedTuple):
     supervisor: SupervisorRow  # of that limiter
     residual_fade: float  # mm; 0 where a residual counts fully near the reference
     residual_reach: float  # mm; infinity where it does far from it
+    tracking_fade: float  # mm; the same of the action `tracking_twist`
 
 
 def make_settings(scenario: Scenario) -> Settings:
@@ -108,4 +109,5 @@ def make_settings(scenario: Scenario) -> Settings:
         ),
         residual_fade=scenario.residual_fade_mm,
         residual_reach=scenario.residual_reach_mm or math.inf,
+        tracking_fade=scenario.action_fade_mm,
     )

@@ -53,15 +53,19 @@ least as much per step as the largest `far` (`reward={"far": -1.0, "alive": 1.2}
 1200 mm) makes up for it. A reward under which being lost pays gives a `ReferenceWarning`."""
 
 LIMITED = """`action_range=(300.0, 3.0)` sets what 1.0 means in `tracking_twist` and `residual`, mm/s and rad/s.
-Learners that begin with actions of standard deviation 1, as those of SB3, need a range about as small as the
-default one: with 300 mm/s and 3 rad/s they hardly learn ([learning.md](learning.md#from-nothing)).
+Near the reference the range of `tracking_twist` shrinks: an action counts with the weight e/(e + F), where e
+is the estimated position error and F = `tracking_fade_mm` (10 mm by default; 0: the whole range everywhere).
+What an action does wrong there stays small: wheels keep their grip, and a constant error of the network leaves
+almost no error of the robot. Learners that begin with actions of standard deviation 1, as those of SB3, need a
+range about as small as the default one ([learning.md](learning.md#what-decides)).
 
 `limiter` puts a [limiter](systems.md#limiters) behind the actions `twist`, `wheel_speed` and `tracking_twist`:
 a preset, a file or a mapping. Motors and tyres can follow what it lets through. It is the law that limits a
 system `CONTROLLER+ESTIMATOR+LIMITER`: the twist that a law wants, as an action, gives the system's command. A
 limiter's `lead_s` shifts the reference that `tracking_twist` adds to; its supervisor needs a `neighbour`. By
-default `twist` and `wheel_speed` are not limited, and `tracking_twist` is, by the default system's `grip`;
-`limiter="none"` takes that away. A `residual` has the limits of its `residual_base`.
+default `twist` and `wheel_speed` are not limited, and `tracking_twist` is, by `approach`: the default system's
+`grip`, and a gentle approach to the reference. `limiter="none"` takes that away. A `residual` has the limits
+of its `residual_base`.
 
 `residual_base` is a controller, by its preset or file, or a policy in Python: an object with SB3's `predict`
 from `tracking` observations to `twist` actions, or `"module:factory"` of one. Such a policy runs once a control

@@ -33,6 +33,10 @@ class TwistLimits(Frozen):
     free_speed_mm_s: NonNegative = 0.0
     free_reach_mm: Positive = 30.0
     reverse_mm_s: NonNegative | None = None  # of u₁ backward
+    # u₁ exceeds the reference's speed at most by √(closing_speed_mm_s² + 2·closing_deceleration_mm_s2·e₁), so
+    # that this deceleration is enough to arrive at the reference with closing_speed_mm_s.
+    closing_deceleration_mm_s2: Positive | None = None
+    closing_speed_mm_s: NonNegative = 20.0
     cancel_slip: Switch = False  # subtract the estimated slip from the wheels' twist
 
 
@@ -50,6 +54,8 @@ class TwistLimitsRow(NamedTuple):
     free: float  # mm/s
     free_reach: float  # mm
     reverse: float  # mm/s
+    closing: float  # mm/s²
+    closing_speed: float  # mm/s
     slip: float  # 1 if the estimated slip is subtracted, else 0
 
 
@@ -69,6 +75,8 @@ def twist_limits_row(limits: TwistLimits, period_s: float) -> TwistLimitsRow:
         free=limits.free_speed_mm_s,
         free_reach=limits.free_reach_mm,
         reverse=infinite_if_none(limits.reverse_mm_s),
+        closing=infinite_if_none(limits.closing_deceleration_mm_s2),
+        closing_speed=limits.closing_speed_mm_s,
         slip=1.0 if limits.cancel_slip else 0.0,
     )
 
@@ -91,6 +99,20 @@ def braked(error: float, linear: float) -> float:
     if abs(error) <= linear:
         return error
     return math.copysign(math.sqrt(linear * (2.0 * abs(error) - linear)), error)
+
+
+@law
+def closing_speed(u_1: float, cruise: float, e_1: float, limits: TwistLimitsRow) -> float:
+    """A wanted speed (mm/s), reduced so that the robot can brake gently before it reaches its reference.
+
+    ``cruise`` is the reference's speed (mm/s), ``e_1`` the forward error (mm). The robots behind drive the
+    same path a time gap later: where a robot brakes hard after it has caught up, they must do so, too, and
+    have nothing left for their own errors.
+    """
+    if limits.closing == math.inf:
+        return u_1
+    final = limits.closing_speed
+    return min(u_1, cruise + math.sqrt(final * final + 2.0 * limits.closing * max(e_1, 0.0)))
 
 
 @law

@@ -16,7 +16,7 @@ from tlf_env.onboard.spacing import Spacing
 from tlf_env.onboard.supervisor import Supervisor
 from tlf_env.onboard.tracking import Controller
 
-DEFAULT_LIMITER = "grip"
+DEFAULT_LIMITER = "approach"
 
 
 class Limiter(Frozen):

@@ -9,7 +9,7 @@ import numpy as np
 
 from tlf_env.numerics.compiled import law
 from tlf_env.onboard.calibration import Belief, believed_wheel_speeds
-from tlf_env.onboard.limiter import braked, limited_twist, saturated
+from tlf_env.onboard.limiter import braked, closing_speed, limited_twist, saturated
 from tlf_env.onboard.observer import Message
 from tlf_env.onboard.rejection import RejectionState, observed_rejection
 from tlf_env.onboard.spacing import Predecessor, spaced_twist
@@ -52,6 +52,7 @@ FULL_RESIDUAL_MM_S = 150.0
 FULL_RESIDUAL_RAD_S = 1.0
 FULL_TRACKING_MM_S = 100.0
 FULL_TRACKING_RAD_S = 1.0
+TRACKING_FADE_MM = 10.0
 
 ACTION_ENTRIES = {
     "twist": (
@@ -76,7 +77,11 @@ ACTION_ENTRIES = {
         Entry("yaw rate added to that command", "rad/s", FULL_RESIDUAL_RAD_S),
     ),
     "tracking_twist": (
-        Entry("forward speed added to the reference's u₁*", "mm/s", FULL_TRACKING_MM_S),
+        Entry(
+            "forward speed added to the reference's u₁*; tracking_fade_mm reduces it near the reference",
+            "mm/s",
+            FULL_TRACKING_MM_S,
+        ),
         Entry("yaw rate added to the reference's u₂*", "rad/s", FULL_TRACKING_RAD_S),
     ),
 }
@@ -217,7 +222,8 @@ def twist_action(
     observation: np.ndarray, scales: np.ndarray, row: ControllerRow, u_1: float, u_2: float
 ) -> tuple[float, float]:
     """The ``twist`` action that commands a twist (mm/s, rad/s), within the limits."""
-    u_1 = max(u_1, -row.limits.reverse)
+    cruise, e_1 = observation[U_1] * scales[U_1], observation[E_1] * scales[E_1]
+    u_1 = max(closing_speed(u_1, cruise, e_1, row.limits), -row.limits.reverse)
     if row.spacing.distance > 0.0 and observation[IS_LEADER] * scales[IS_LEADER] < 0.5:
         u_1, u_2 = spaced_twist(u_1, u_2, received_predecessor(observation, scales), row.spacing)
     v_1, v_2 = limited_twist(
@@ -227,8 +233,8 @@ def twist_action(
         observation[COMMAND_2] * scales[COMMAND_2],
         observation[SLIP_1] * scales[SLIP_1],
         observation[SLIP_2] * scales[SLIP_2],
-        observation[U_1] * scales[U_1],
-        math.hypot(observation[E_1] * scales[E_1], observation[E_2] * scales[E_2]),
+        cruise,
+        math.hypot(e_1, observation[E_2] * scales[E_2]),
         row.limits,
     )
     return clipped_action(v_1 / FULL_SPEED_MM_S), clipped_action(v_2 / FULL_YAW_RATE_RAD_S)
@@ -250,7 +256,8 @@ def residual_share(observation: np.ndarray, scales: np.ndarray, fade: float, rea
 
     A residual is an action added to a base controller's twist. Near the reference and far from it the base
     controller acts alone. Near, a residual then only changes the gain, and its bias causes no steady error;
-    far, the base controller is known to return. The weight is 1 if ``fade`` is 0 and ``reach`` infinite.
+    far, the base controller is known to return. An action about the reference has the first
+    factor alone. The weight is 1 if ``fade`` is 0 and ``reach`` infinite.
     """
     if fade == 0.0 and reach == math.inf:
         return 1.0

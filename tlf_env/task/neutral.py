@@ -59,6 +59,7 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "adversary": False,
         "action": "twist",
         "action_range": None,
+        "tracking_fade_mm": None,
         "limiter": None,
         "residual_base": "consistent",
         "residual_fade_mm": 0.0,
@@ -284,6 +285,8 @@ NEUTRAL: dict[str, dict[str, Any]] = {
         "free_speed_mm_s": 0.0,
         "free_reach_mm": 30.0,
         "reverse_mm_s": None,
+        "closing_deceleration_mm_s2": None,
+        "closing_speed_mm_s": 20.0,
         "cancel_slip": False,
     },
     "Spacing": {

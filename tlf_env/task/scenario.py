@@ -53,6 +53,7 @@ from tlf_env.task.actions import (
     OUTSIDE_RESIDUAL,
     RANGED_KINDS,
     REFERENCE,
+    TRACKING_FADE_MM,
     ActionKind,
     action_entries,
 )
@@ -177,8 +178,10 @@ class Scenario(Frozen):
     action: ActionKind = "twist"
     # What 1.0 means in the actions `residual` and `tracking_twist`, mm/s and rad/s; None: 150 and 1, 100 and 1.
     action_range: tuple[Positive, Positive] | None = None
+    # Estimated position error at which `tracking_twist` has half its range; None: 10. 0: all of it everywhere.
+    tracking_fade_mm: NonNegative | None = None
     # What the actions `twist`, `wheel_speed` and `tracking_twist` are limited by: a preset, a file or a
-    # mapping. None: the default's limiter for `tracking_twist`, no limits for the others.
+    # mapping. None: `approach` for `tracking_twist`, no limits for the others.
     limiter: Limiter | None = None
     # Base controller of the action `residual`, which is added to its twist: a preset, a file, or a policy in
     # Python, `module:factory`.
@@ -343,6 +346,10 @@ class Scenario(Frozen):
             raise ValueError(
                 f"action_range goes with the actions {' and '.join(RANGED_KINDS)}, not with {self.action!r}"
             )
+        if self.tracking_fade_mm is not None and self.action != "tracking_twist":
+            raise ValueError(
+                f"tracking_fade_mm goes with the action tracking_twist, not with {self.action!r}"
+            )
         if self.limiter is None:
             return
         limited = LIMITED_OUTSIDE_KINDS if self.outside_base else LIMITED_KINDS
@@ -491,6 +498,11 @@ class Scenario(Frozen):
     def action_entries(self) -> tuple[Entry, ...]:
         """Meaning, unit and scale of the components of an action."""
         return action_entries(self.action, self.action_range)
+
+    @property
+    def action_fade_mm(self) -> float:
+        """Estimated position error at which an action about the reference has half its range."""
+        return TRACKING_FADE_MM if self.tracking_fade_mm is None else self.tracking_fade_mm
 
     @property
     def action_limiter(self) -> Limiter:
