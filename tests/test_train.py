@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import signal
 import sys
@@ -163,9 +162,14 @@ class TestTraining:
     def test_an_interrupted_training_continues_to_the_same_policy(
         self, name, tmp_path, monkeypatch
     ):
-        from baselines.training.train import CHECKPOINT_FILE, POLICY_FILE, train
+        from baselines.training.train import (
+            CHECKPOINT_FILE,
+            POLICY_FILE,
+            FormationVecEnv,
+            train,
+        )
 
-        monkeypatch.setattr("baselines.sb3.ENDS_KEPT", 20)
+        monkeypatch.setattr(sys.modules[FormationVecEnv.__module__], "ENDS_KEPT", 20)
         config = load_config({**CONFIG, **ALGORITHMS[name]})
         whole = train(config, 3, tmp_path / "whole")
         assert whole["level_count"] == (2 if config.curriculum else 1)
@@ -174,7 +178,7 @@ class TestTraining:
         def interrupt(done: int, total: int) -> None:
             stops.append(done)
             if len(stops) in (1, 3):
-                os.kill(os.getpid(), signal.SIGINT)
+                signal.raise_signal(signal.SIGINT)  # in this thread, not in one of a library
 
         parts = tmp_path / "parts"
         for _ in range(2):
