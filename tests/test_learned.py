@@ -502,7 +502,8 @@ def test_a_custom_policy_may_ask_for_fields():
     assert fitted.overrides["preview_s"] == []
     assert fit_policy("asking:Sensing", load_scenario(action="twist")).scenario.action == "twist"
     with pytest.raises(
-        ValueError, match="must map fields of action, action_range, limiter, observation"
+        ValueError,
+        match="must map fields of action, action_range, tracking_fade_mm, limiter, observation",
     ):
         fit_policy("asking:Greedy", TWIST)
     with pytest.raises(

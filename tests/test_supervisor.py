@@ -456,7 +456,7 @@ def test_the_hash_of_a_policy_covers_the_base(tmp_path):
 @pytest.mark.parametrize(
     ("fields", "said"),
     [
-        ({"base": "bodi"}, "'bodi' is not one of body"),
+        ({"base": "bodi"}, "'bodi' is not one of approach, body"),
         ({"base": "no_such.yaml"}, "cannot read no_such.yaml"),
         ({"base": "supervised"}, "base 'supervised' has a base itself; one level is allowed"),
         ({"base": 3}, "base 3 must be a limiter's name or its file"),

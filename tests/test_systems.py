@@ -107,7 +107,10 @@ def test_a_path_with_a_plus_is_still_one_controller(tmp_path):
             "estimator 'body' is not one of ekf, ekf-slip, ekf-gyro, truth, ekf-slip-without",
         ),
         ("kanayama+", "estimator '' is not one of ekf"),
-        ("kanayama+ekf+bodi", "limiter 'bodi' is not one of body, .*, FILE.yaml; did you mean"),
+        (
+            "kanayama+ekf+bodi",
+            "limiter 'bodi' is not one of approach, body, .*, FILE.yaml; did you mean",
+        ),
         (
             "kanayama+ekf+",
             "limiter '' is not one of approach, body, grip, none, supervised, yaw-rate, FILE",

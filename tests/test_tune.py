@@ -652,7 +652,7 @@ def test_a_controller_is_searched_with_the_broadcasts_of_its_system():
         ),
         ({"start": "kanayama+ukf+body"}, "estimator 'ukf' is a Python object; a search runs on"),
         ({"start": "kanayama:no_such"}, "kanayama 'no_such' is not one of bounded"),
-        ({"start": "kanayama+ekf-slip+bodi"}, "limiter 'bodi' is not one of body"),
+        ({"start": "kanayama+ekf-slip+bodi"}, "limiter 'bodi' is not one of approach, body"),
         ({"estimator": "ekf"}, "names the estimator 'ekf-slip'; estimator is 'ekf'"),
         ({"search": {"law.gain": {"low": 1, "high": 2}}}, "'law.gain' is not one of law.braking"),
         ({"search": {"gains.k_1_per_s": {"low": 1, "high": 2}}}, "'gains.k_1_per_s' is not one of"),
