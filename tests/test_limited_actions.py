@@ -182,6 +182,30 @@ def test_a_limiter_without_limits_changes_no_bit(kind):
         assert one.arrays.states.tobytes() == other.arrays.states.tobytes()
 
 
+def test_a_robot_that_catches_up_slows_down_before_it_arrives():
+    """With an action that always wants to be faster, unless it would have to brake harder than it may."""
+    formation = at_start(action="tracking_twist", horizon_s=20.0)
+    limits = load_limiter("approach").limits
+    assert limits.closing_deceleration_mm_s2 is not None
+    least = limits.turning_acceleration_mm_s2  # in a turn; more on a straight
+    assert least is not None
+    held = 0
+    for _ in range(950):
+        seen = formation.arrays.observations[0] * SCALES
+        formation.arrays.actions[0] = np.tile([1.0, 0.0], (3, 1))
+        formation.step()
+        e_1, slip = np.maximum(seen[:, place("e_1")], 0.0), seen[:, place("slip_1")]
+        closing = np.sqrt(
+            limits.closing_speed_mm_s**2 + 2.0 * limits.closing_deceleration_mm_s2 * e_1
+        )
+        most = seen[:, place("reference_u_1")] + closing
+        braked = seen[:, place("command_u_1")] + slip - least * PERIOD_S
+        speed = commanded(formation)[0] + slip
+        assert (speed <= np.maximum(most, braked) + 0.1).all()
+        held += int((np.abs(speed - most) < 0.1).sum())
+    assert held > 100  # it is this limit that holds the robots back
+
+
 def test_without_a_limiter_of_its_own_the_action_about_the_reference_has_the_usual_one():
     usual = load_scenario("infinity", action="tracking_twist")
     assert usual.limiter is None
