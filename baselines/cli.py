@@ -535,7 +535,7 @@ def train(
     config: Annotated[
         str,
         typer.Argument(
-            help="Training: scratch, residual, direct, quick, sac, recurrent, or a YAML file."
+            help="Training: scratch, from-nothing, residual, quick, sac, recurrent, or a YAML file."
         ),
     ],
     seeds: Annotated[str, typer.Option(help="Training seeds, comma-separated.")] = "0",

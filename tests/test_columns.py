@@ -146,7 +146,8 @@ def test_a_policy_asks_for_its_previews_only_if_the_scenario_lacks_one(tmp_path)
 
 
 def test_an_entry_that_is_gone_or_has_another_scale_is_named(monkeypatch):
-    scenario, entries = load_scenario(), dict(observation.TRACKING_ENTRIES)
+    scenario = fit_policy("from-nothing", load_scenario()).scenario
+    entries = dict(observation.TRACKING_ENTRIES)
     rows = np.zeros((1, len(tracking_entries(DEFAULT_PREVIEW_S))))
     coarse = entries["slip_2"]._replace(scale=2.0)
     for changed, said in (
@@ -160,10 +161,11 @@ def test_an_entry_that_is_gone_or_has_another_scale_is_named(monkeypatch):
         ),
     ):
         monkeypatch.setattr(observation, "TRACKING_ENTRIES", changed)
-        with pytest.raises(ValueError, match=f"policy 'direct' does not fit the scenario.*{said}"):
-            make_policy("direct", scenario)
+        refused = f"policy 'from-nothing' does not fit the scenario.*{said}"
+        with pytest.raises(ValueError, match=refused):
+            make_policy("from-nothing", scenario)
         with pytest.raises(ValueError, match=said):
-            load_policy("direct").predict(rows)
+            load_policy("from-nothing").predict(rows)
 
 
 def test_a_new_card_names_the_entries_in_the_scenarios_order(tmp_path, later_observation):

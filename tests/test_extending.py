@@ -100,7 +100,7 @@ plant.reset(seed=20000)
 print("payload", round(plant.applied[0, 0, number("payload.mass_kg")], 5))
 for disturbance in ("nominal", "combined-hard", "payload"):
     print("hash", scenario_hash(tlf_env.load_scenario("infinity", disturbance=disturbance)))
-for name in ("residual", "direct"):
+for name in ("residual", "from-nothing"):
     policy = load_policy(name)
     fields = {**policy.scenario_overrides, "end_on": ()}
     plant = tlf_env.BatchPlant("infinity", 4, disturbance="combined-hard", **fields)

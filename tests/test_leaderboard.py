@@ -88,8 +88,8 @@ def test_the_verdicts_of_the_readme_are_those_of_the_board():
         ("reference:linearised", "The default fails in"),
         ("reference:consistent", "controllers fail in"),
         ("reference:tuned", "gains and limits, fails in"),
-        ("residual", "38 of the 49 pairs, fails in"),
-        ("direct", "`direct` fails in"),
+        ("residual", "default beneath it and fails in"),
+        ("from-nothing", "without a controller beneath it, fails in"),
     ):
         assert f"{lead} {failed[policy]} of {runs}" in verdicts, policy
     medians = {
@@ -102,16 +102,25 @@ def test_the_verdicts_of_the_readme_are_those_of_the_board():
         return sum(medians[one, *place] < medians[other, *place] for place in places)
 
     default = "reference:linearised"
-    learning = " ".join((ROOT.parent / "learning.md").read_text("utf-8").split())
     assert f"than the default's in {smaller(searched, default)} of the 49 pairs" in verdicts
-    over_base = smaller("residual", "reference:tuned")
-    assert f"than `tuned` beneath it in {over_base} of the 49 pairs" in verdicts
-    assert f"that of `tuned` in {over_base} of 49 pairs" in learning
-    found = f"{smaller('residual', default)} of 49 pairs, `adrc:searched` in {smaller(searched, default)}"
-    assert f"has the smaller median in {found}" in learning
+    assert f"in {smaller('residual', default)} of the 49 pairs a smaller" in verdicts
+    assert f"in {smaller('from-nothing', searched)} of the 49 pairs a smaller" in verdicts
     split = {
         cell["policy"]: make_board.failures(cell)
         for cell in BOARD["cells"]
         if (cell["task"], cell["disturbance"]) == ("infinity", "split-ice")
     }
     assert f"{split['reference:linearised']} of them on the ∞ with ice under one side" in verdicts
+
+
+def test_the_page_on_learning_has_the_boards_verdicts():
+    make_learning = importlib.import_module("make_learning")
+    page = (ROOT.parent / "learning.md").read_text("utf-8")
+    curves = make_learning.kept_curves()
+    for name, table in (
+        ("verdicts", make_learning.verdicts(BOARD)),
+        ("trainings", make_learning.trainings(curves, make_learning.SHIPPED)),
+        ("ladder", make_learning.trainings(curves, make_learning.LADDER)),
+    ):
+        assert f"<!-- {name} -->\n{table}\n<!-- end of {name} -->" in page
+    assert set(curves) == {*make_learning.SHIPPED, *make_learning.LADDER}

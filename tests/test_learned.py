@@ -451,10 +451,10 @@ def test_a_policy_asks_for_the_broadcasts_of_its_training(tmp_path):
     assert fit_policy(str(usual), TWIST).overrides == {"estimator": "ekf"}
 
 
-@pytest.mark.parametrize("name", ["residual", "direct"])
+@pytest.mark.parametrize("name", ["residual", "from-nothing"])
 def test_the_shipped_policies_run_on_the_filter_of_their_training(name):
-    scenario = fit_policy(name, TWIST).scenario
-    assert (scenario.estimator, scenario.broadcast_smoothing_s) == ("ekf-slip", 0.0)
+    scenario = fit_policy(name, load_scenario(**SHORT)).scenario
+    assert (scenario.estimator, scenario.smoothing_s) == ("ekf-gyro", 0.1)
 
 
 def test_a_card_names_no_code_that_is_run(tmp_path):

@@ -8,15 +8,13 @@ about half an hour and needs the extra ``figures``. ``--only FAMILY`` renews one
 
 from __future__ import annotations
 
-import argparse
 from collections.abc import Callable
 from typing import Any
 
 from family_devices import draw_motors, draw_robots, draw_sensors
 from family_outside import draw_floor, draw_grip, draw_slip
 from make_board import DOCS
-from make_limits import SMOOTH, friction, noise, ramped, sines, table, wet
-from make_parts import put
+from make_limits import ENTRIES, SMOOTH, arguments, friction, noise, ramped, renew, sines, wet
 from matplotlib.figure import Figure
 
 from baselines.runs.seed_ranges import FIRST_TABLE_SEED
@@ -247,8 +245,7 @@ def draw(family: str) -> None:
 
 def main() -> None:
     """Drive and write the tables, draw the pictures."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=16)
+    parser = arguments(__doc__)
     parser.add_argument("--only", default=",".join(FAMILIES), help="families, comma-separated")
     parser.add_argument("--tables", action="store_true", help="no pictures")
     parser.add_argument("--figures", action="store_true", help="no tables")
@@ -259,7 +256,8 @@ def main() -> None:
         if not options.tables:
             draw(family)
         if not options.figures:
-            put(FOLDER / f"{family}.md", table(FAMILIES[family], seeds), "entries")
+            page, entries = FOLDER / f"{family}.md", options.entry or ENTRIES
+            renew(page, "entries", FAMILIES[family], seeds, entries)
 
 
 if __name__ == "__main__":

@@ -7,14 +7,12 @@ and needs the extra ``figures``. ``--seeds N`` drives fewer, 0 none.
 
 from __future__ import annotations
 
-import argparse
 import math
 from typing import Any
 
 import numpy as np
 from make_board import DOCS
-from make_limits import SMOOTH, table
-from make_parts import put
+from make_limits import ENTRIES, SMOOTH, arguments, renew
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
@@ -151,13 +149,11 @@ def picture() -> Figure:
 
 def main() -> None:
     """Drive and write the table, and draw."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=16)
-    options = parser.parse_args()
+    options = arguments(__doc__).parse_args()
     if options.seeds:
         seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + options.seeds)
         rows = {name: SMOOTH | fields for name, fields in ROWS.items()}
-        put(DOCS / "hardware.md", table(rows, seeds), "presets")
+        renew(DOCS / "hardware.md", "presets", rows, seeds, options.entry or ENTRIES)
     with atomic(PICTURE, "wb") as file:
         picture().savefig(file, format="png", dpi=DPI, metadata=METADATA.get("png"))
 

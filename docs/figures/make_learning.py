@@ -1,19 +1,23 @@
-"""Write the table of trainings and the learning curves of ``docs/learning.md``.
+"""Write the tables of trainings and the learning curves of ``docs/learning.md``.
 
-First run ``tlf train NAME --seeds 0,1,2``, then
-``python docs/figures/make_learning.py results/train/residual results/train/direct``. This needs the extra
-``figures``. The curves are copied to ``docs/learning/``; without folders the script uses these copies.
+First run ``tlf train NAME --seeds 0,1,2`` of the shipped policies and ``tlf train NAME`` of the ladder, then
+``python docs/figures/make_learning.py results/train/*``. This needs the extra ``figures``. The curves are
+copied to ``docs/learning/``; without folders the script uses these copies. What the board says of the shipped
+policies is read from ``docs/leaderboard/leaderboard.json``.
 """
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
 import matplotlib
-from make_figures import BLUE, FOLDER, GREEN, GREY, ORANGE, STYLE
+from make_board import METRIC, Board, failures, plan_of
+from make_figures import BLUE, FOLDER, ORANGE, STYLE
+from make_parts import put
 from make_speed import table
 from matplotlib.figure import Figure
 
@@ -22,10 +26,21 @@ from tlf_env.common.files import atomic
 
 DOCS = FOLDER.parent
 KEPT = DOCS / "learning"
-BEGIN, END = "<!-- trainings -->", "<!-- end of trainings -->"
-COLOURS = {"residual": BLUE, "direct": ORANGE}
+SHIPPED = {"residual": BLUE, "from-nothing": ORANGE}  # and their colours
+LADDER = (
+    "ladder-1-point",
+    "scratch",
+    "ladder-3-slip",
+    "ladder-4-start",
+    "ladder-5-combined",
+    "curriculum",
+    "ladder-6-ice",
+)
+RIVALS = {
+    "residual": "reference:linearised",  # its base
+    "from-nothing": "adrc:searched+ekf-gyro-smoothed+grip",  # the fewest failures without learning
+}
 MILLION = 1e6
-TICKS_MM = (2, 3, 5, 10, 20, 50)
 
 Curve = dict[str, Any]
 
@@ -60,12 +75,12 @@ def kept_curves() -> dict[str, list[Curve]]:
     return curves
 
 
-def trainings(curves: dict[str, list[Curve]]) -> str:
-    """The table of trainings: one row per seed."""
+def trainings(curves: dict[str, list[Curve]], names: Iterable[str]) -> str:
+    """A table of trainings: one row per seed."""
     head = ["training", "seed", "score at the start", "kept", "failed", "at robot steps", "minutes"]
     rows = []
-    for name, seeds in curves.items():
-        for curve in seeds:
+    for name in names:
+        for curve in curves.get(name, []):
             first, last = curve["evaluations"][0], kept_evaluation(curve)
             runs = sum(cell["runs"] for cell in last["cells"].values())
             rows.append(
@@ -82,50 +97,92 @@ def trainings(curves: dict[str, list[Curve]]) -> str:
     return table(head, rows)
 
 
-def draw(curves: dict[str, list[Curve]], path: Path) -> None:
-    """Draw the score on the validation seeds and the mean reward of the training against robot steps."""
+def points(rows: list[dict[str, float]], name: str) -> tuple[list[float], list[float]]:
+    """The robot steps of a curve's rows, in millions, and one of their numbers."""
+    return [row["robot_steps"] / MILLION for row in rows], [row[name] for row in rows]
+
+
+def draw_shipped(curves: dict[str, list[Curve]], path: Path) -> None:
+    """Draw score and mean reward of the shipped policies' trainings against robot steps."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.2), layout="constrained")
         left, right = figure.subplots(1, 2)
-        for name, seeds in curves.items():
-            colour = COLOURS.get(name, GREEN)
+        for name, colour in SHIPPED.items():
+            seeds = curves.get(name, [])
             for i, curve in enumerate(seeds):
-                count = "1 seed" if len(seeds) == 1 else f"{len(seeds)} seeds"
-                label = f"{name}, {count}" if i == 0 else None
-                rows = curve["evaluations"]
-                steps = [row["robot_steps"] / MILLION for row in rows]
-                left.plot(steps, [row["score_mm"] for row in rows], ".-", color=colour, label=label)
-                rows = curve["rollouts"]
-                steps = [row["robot_steps"] / MILLION for row in rows]
-                right.plot(steps, [row["mean_reward"] for row in rows], color=colour, label=label)
-        start = next(iter(curves.get("residual", [])), None)
-        if start is not None:
-            left.axhline(
-                start["evaluations"][0]["score_mm"], color=GREY, ls="--", label="tuned reference"
-            )
+                label = f"{name}, {len(seeds)} seeds" if i == 0 else None
+                found = points(curve["evaluations"], "score_mm")
+                left.plot(*found, ".-", color=colour, label=label)
+                found = points(curve["rollouts"], "mean_reward")
+                right.plot(*found, color=colour, label=label)
         left.set(
             xlabel="robot steps, millions", ylabel="score on validation seeds, mm", yscale="log"
         )
         right.set(xlabel="robot steps, millions", ylabel="mean reward of a robot and step")
-        left.set_yticks(TICKS_MM, [f"{tick:g}" for tick in TICKS_MM])
-        left.minorticks_off()
         left.legend()
         figure.savefig(path)
 
 
+def draw_ladder(curves: dict[str, list[Curve]], path: Path) -> None:
+    """Draw the score of every rung of the ladder against robot steps, a panel for each."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 3.8), layout="constrained")
+        panels = figure.subplots(2, 4, sharex=True, sharey=True).flat
+        for name, panel in zip(LADDER, panels, strict=False):
+            for curve in curves.get(name, []):
+                panel.plot(*points(curve["evaluations"], "score_mm"), ".-", color=BLUE)
+            panel.set(title=name, yscale="log")
+        list(panels)[-1].set_axis_off()
+        figure.supxlabel("robot steps, millions", fontsize="medium")
+        figure.supylabel("score on validation seeds, mm", fontsize="medium")
+        figure.savefig(path)
+
+
+def verdicts(board: Board) -> str:
+    """A table of each shipped policy against its rival, over all pairs of the board."""
+    cells = {(cell["policy"], cell["task"], cell["disturbance"]): cell for cell in board["cells"]}
+    places = plan_of(board).places
+    columns = []
+    for policy, rival in RIVALS.items():
+        pairs = {place: (cells[policy, *place], cells[rival, *place]) for place in places}
+        more = {place: failures(mine) - failures(other) for place, (mine, other) in pairs.items()}
+        worse = [f"{', '.join(place)}: {n}" for place, n in more.items() if n > 0]
+        medians = [[cell[METRIC]["median"] for cell in pair] for pair in pairs.values()]
+        columns.append(
+            [
+                f"`{policy}`",
+                f"`{rival}`",
+                *(str(sum(failures(pair[k]) for pair in pairs.values())) for k in (0, 1)),
+                f"{sum(n < 0 for n in more.values())} of {len(places)}",
+                "; ".join(worse) or "none",
+                f"{sum(mine < other for mine, other in medians)} of {len(places)}",
+            ]
+        )
+    names = (
+        "policy",
+        "rival",
+        "failed runs of the policy",
+        "of the rival",
+        "fewer failed runs in",
+        "more failed runs in",
+        "smaller median error in",
+    )
+    head, *rows = [list(row) for row in zip(names, *columns, strict=True)]
+    return table(head, rows)
+
+
 def main(folders: list[str]) -> None:
-    """Copy the curves of the folders, then write table and figure from all copies."""
+    """Copy the curves of the folders, then write tables and figures from all copies."""
     for folder in folders:
         keep(Path(folder))
     curves = kept_curves()
-    draw(curves, KEPT / "curves.png")
+    draw_shipped(curves, KEPT / "curves.png")
+    draw_ladder(curves, KEPT / "ladder.png")
     page = DOCS / "learning.md"
-    text = page.read_text("utf-8")
-    if BEGIN not in text or END not in text:
-        raise ValueError(f"{page} lacks {BEGIN} or {END}")
-    before, after = text.split(BEGIN)[0], text.split(END)[1]
-    with atomic(page, encoding="utf-8") as file:
-        file.write(f"{before}{BEGIN}\n{trainings(curves)}\n{END}{after}")
+    put(page, trainings(curves, SHIPPED), "trainings")
+    put(page, trainings(curves, LADDER), "ladder")
+    board = json.loads((DOCS / "leaderboard" / "leaderboard.json").read_text("utf-8"))
+    put(page, verdicts(board), "verdicts")
 
 
 if __name__ == "__main__":

@@ -2,13 +2,15 @@
 
 Writes the tables of ``docs/limits.md``. ``python docs/figures/make_limits.py`` drives 16 seeds of each cell
 for 60 s on the batch plant; it takes about a quarter of an hour and needs no extra. ``--seeds N`` drives
-fewer.
+fewer, ``--entry NAME`` only some columns.
 """
 
 from __future__ import annotations
 
 import argparse
 import math
+from collections.abc import Iterable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,7 +27,9 @@ HORIZON_S = 60.0
 ENTRIES = {
     "`consistent`": ("reference:consistent", {}),
     "`tuned`": ("reference:tuned", {}),
+    "`linearised`": ("reference:linearised", {}),
     "`residual`": ("residual", {}),
+    "`from-nothing`": ("from-nothing", {}),
     "`tuned`, true state": ("reference:tuned", {"estimator": "truth"}),
 }
 SMOOTH = {"start_ramp_s": 6.0}
@@ -122,26 +126,63 @@ def cell(entry: tuple[str, dict[str, Any]], fields: dict[str, Any], seeds: range
     return f"{float(f'{rms_mm:.3g}'):g}" + (f" ({lost})" if lost else "")
 
 
-def table(rows: dict[str, dict[str, Any]], seeds: range) -> str:
-    """A row for each condition, a column for each entry."""
+def cells_of(table: str) -> dict[tuple[str, str], str]:
+    """The cells of a table by row and column."""
+    rows = [
+        [text.strip() for text in line.strip("| ").split(" | ")]
+        for line in table.splitlines()
+        if line.startswith("| ")
+    ]
+    if not rows:
+        return {}
+    names = rows[0]  # of the columns; the first has no name
+    return {
+        (row[0], name): text for row in rows[1:] for name, text in zip(names, row[1:], strict=True)
+    }
+
+
+def renew(
+    page: Path, name: str, rows: dict[str, dict[str, Any]], seeds: range, entries: Iterable[str]
+) -> None:
+    """Write a page's table: a row for each condition, a column for each entry.
+
+    Only the columns of ``entries`` are driven. The others are kept; they must be in the page.
+    """
+    text = page.read_text("utf-8")
+    old = cells_of(text.partition(f"<!-- {name} -->")[2].partition(f"<!-- end of {name} -->")[0])
     lines = ["| | " + " | ".join(ENTRIES) + " |", "|---" + "|---:" * len(ENTRIES) + "|"]
-    for name, fields in rows.items():
-        cells = [cell(entry, fields, seeds) for entry in ENTRIES.values()]
-        lines.append(f"| {name} | " + " | ".join(cells) + " |")
+    for row, fields in rows.items():
+        cells = [
+            cell(entry, fields, seeds) if column in entries else old[row, column]
+            for column, entry in ENTRIES.items()
+        ]
+        lines.append(f"| {row} | " + " | ".join(cells) + " |")
         print(lines[-1], flush=True)
-    return "\n".join(lines)
+    put(page, "\n".join(lines), name)
+
+
+def arguments(description: str | None) -> argparse.ArgumentParser:
+    """What the scripts that write such tables are given."""
+    parser = argparse.ArgumentParser(description=description)
+    parser.add_argument("--seeds", type=int, default=16)
+    parser.add_argument(
+        "--entry",
+        action="append",
+        choices=ENTRIES,
+        help="drive only these; others keep their cells",
+    )
+    return parser
 
 
 def main() -> None:
     """Drive and write the tables."""
-    parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("--seeds", type=int, default=16)
+    parser = arguments(__doc__)
     parser.add_argument("--tables", default=",".join(TABLES), help="comma-separated")
     options = parser.parse_args()
     seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + options.seeds)
     for name in options.tables.split(","):
         print(name, flush=True)
-        put(DOCS / "limits.md", table(TABLES[name], seeds), name)
+        renew(DOCS / "limits.md", name, TABLES[name], seeds, options.entry or ENTRIES)
 
 
 if __name__ == "__main__":

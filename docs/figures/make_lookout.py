@@ -29,7 +29,7 @@ ENTRIES = (
     "pure_pursuit+ekf",
     "feedback_linearisation+ekf",
     "residual",
-    "direct",
+    "from-nothing",
 )
 
 
