@@ -127,12 +127,13 @@ def draw_ladder(curves: dict[str, list[Curve]], path: Path) -> None:
     """Draw the score of every rung of the ladder against robot steps, a panel for each."""
     with matplotlib.rc_context(STYLE):
         figure = Figure(figsize=(8.0, 3.8), layout="constrained")
-        panels = figure.subplots(2, 4, sharex=True, sharey=True).flat
+        panels = figure.subplots(2, 4, sharex=True, sharey=True).ravel()
         for name, panel in zip(LADDER, panels, strict=False):
             for curve in curves.get(name, []):
                 panel.plot(*points(curve["evaluations"], "score_mm"), ".-", color=BLUE)
             panel.set(title=name, yscale="log")
-        list(panels)[-1].set_axis_off()
+        panels[-1].set_axis_off()
+        panels[-5].tick_params(labelbottom=True)  # the panel above it
         figure.supxlabel("robot steps, millions", fontsize="medium")
         figure.supylabel("score on validation seeds, mm", fontsize="medium")
         figure.savefig(path)
