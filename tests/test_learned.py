@@ -457,6 +457,11 @@ def test_the_shipped_policies_run_on_the_filter_of_their_training(name):
     assert (scenario.estimator, scenario.smoothing_s) == ("ekf-gyro", 0.1)
 
 
+def test_the_shipped_residual_is_refused_on_another_filter():
+    with pytest.raises(ValueError, match="estimator 'ekf-gyro', the scenario has 'ekf'"):
+        fit_policy("residual", load_scenario(estimator="ekf", **SHORT))
+
+
 def test_a_card_names_no_code_that_is_run(tmp_path):
     path = written(tmp_path, scenario=RESIDUAL)
     change_card(path, lambda card: card | {"estimator": "os:system"})
