@@ -622,3 +622,64 @@ def test_a_horizon_beyond_the_clock_is_warned_of():
     (line,) = sensor_lines(horizon_s=1000.02)
     assert "t = 1000 s" in line
     assert "1000.02 s" in line
+
+
+def test_a_scenario_is_built_on_another(tmp_path):
+    """Mappings are merged, and a file's own values come first, as keywords of `load_scenario` do."""
+    path = written(
+        tmp_path, "base: infinity\ntime_gap_s: 3\ntrajectory: {phase_y_rad: 1}\n", "own.yaml"
+    )
+    found = load_scenario(path)
+    assert found == load_scenario(
+        "infinity", name="own", time_gap_s=3, trajectory={"phase_y_rad": 1}
+    )
+    second = written(tmp_path, "base: own.yaml\nrobots: 5\n", "second.yaml")
+    assert load_scenario(second) == load_scenario(found, name="second", robots=5)
+    assert load_scenario({"base": "infinity", "robots": 5}) == load_scenario("infinity", robots=5)
+
+
+def test_a_disturbance_is_built_on_another(tmp_path):
+    more = {"slip": {"delta_1_mm_s": 40}}
+    found = load_scenario("infinity", disturbance={"base": "slip", **more}).disturbance
+    slip = load_scenario("infinity", disturbance="slip").disturbance
+    assert found.constant("slip.delta_1_mm_s") == 40
+    assert found.constant("slip.delta_2_rad_s") == slip.constant("slip.delta_2_rad_s") != 0
+    assert found.position == slip.position
+    written(tmp_path, "base: slip\nslip: {delta_1_mm_s: 40}\nname: slip\n", "more.yaml")
+    path = written(tmp_path, "base: infinity\ndisturbance: more.yaml\n", "own.yaml")
+    assert load_scenario(path).disturbance == found
+
+
+def test_the_trajectory_of_another_scenario_or_of_a_path(tmp_path):
+    flower = load_scenario("flower")
+    assert load_scenario("infinity", trajectory="flower").trajectory == flower.trajectory
+    written(tmp_path, "t_s,x_mm,y_mm\n0,0,0\n10,1000,0\n20,2000,500\n", "path.csv")
+    path = written(tmp_path, "base: infinity\ntrajectory: path.csv\nhorizon_s: 20\n", "own.yaml")
+    points = load_scenario(path).trajectory.points
+    assert points == ((0, 0, 0), (10, 1000, 0), (20, 2000, 500))
+    turned = load_scenario(
+        {"base": "infinity", "trajectory": "infinity"}, trajectory={"phase_y_rad": 1}
+    )
+    assert turned.trajectory.phase_y_rad == 1
+
+
+@pytest.mark.parametrize(
+    ("data", "named"),
+    [
+        ({"base": 3}, "base 3 must be the name of a scenario"),
+        ({"base": "infiniti"}, "did you mean 'infinity'?"),
+        ({"base": "infinity", "trajectory": "flowr"}, "did you mean 'flower'?"),
+        ({"base": "infinity", "disturbance": {"base": "slp"}}, "did you mean 'slip'?"),
+        ({"base": "infinity", "disturbance": {"base": 3}}, "base 3 must be the name of a disturb"),
+        ({"base": "infinity", "trajectory": "nowhere.csv"}, "nowhere.csv"),
+    ],
+)
+def test_what_cannot_be_built_on_is_refused_and_named(data, named):
+    assert named in refusal(data)
+
+
+def test_scenarios_that_are_built_on_themselves_are_refused(tmp_path):
+    path = written(tmp_path, "base: own.yaml\n", "own.yaml")
+    assert "own.yaml: more than 20 of them are built on each other" in refusal(path)
+    path = written(tmp_path, "trajectory: own.yaml\n", "own.yaml")
+    assert "own.yaml: more than 20 scenarios name each other" in refusal(path)

@@ -84,6 +84,8 @@ def test_shipped_configs_are_valid(path: Path):
         ({"disturbances": {"slip": 0}}, "at least one share must be above 0"),
         ({"tasks": {"square": {}}}, "scenario 'square' is not one of"),
         ({"tasks": {"infinity": {"speed": 1}}}, "speed: unknown key"),
+        ({"tasks": {"turned": {"base": "infiniti"}}}, "scenario 'infinty' is not one of"),
+        ({"tasks": {"turned": {"base": 3}}}, "tasks.turned.base 3 must be the name of a scenario"),
         (
             {"network": {"lstm": 8}},
             "RecurrentPPO, and no other algorithm, needs network.lstm; got 8",
@@ -106,6 +108,22 @@ def test_a_wrong_config_is_reported_in_one_line(changes: dict, said: str):
     with pytest.raises(ValueError, match=re.escape(said)) as error:
         load_config({**CONFIG, **changes})
     assert "\n" not in str(error.value)
+
+
+def test_a_task_may_be_built_on_another(tmp_path):
+    (tmp_path / "own.yaml").write_text("base: infinity\nrobots: 4\n", encoding="utf-8")
+    tasks = {
+        "mirrored": {"base": "infinity", "trajectory": {"phase_y_rad": 3.0}},
+        "more": {"base": "own.yaml"},
+    }
+    path = tmp_path / "training.yaml"
+    path.write_text(json.dumps({**CONFIG, "tasks": tasks}), encoding="utf-8")
+    found, _ = load_config(path).mixture()
+    mirrored, more = (found[task][0] for task in tasks)
+    assert mirrored.name == "mirrored"
+    assert mirrored.trajectory.phase_y_rad == 3.0
+    assert mirrored.trajectory.amplitude_x_mm == 2000
+    assert (more.name, more.robots) == ("more", 4)
 
 
 def test_a_disturbance_may_have_a_level_of_its_own():

@@ -23,7 +23,8 @@ from tlf_env.onboard.tracking import (
 )
 from tlf_env.task.actions import ACTION_SIZE, allowed_twist, twist_action, wanted_twist
 from tlf_env.task.observation import NEIGHBOUR_ENTRIES, Tracking, tracking_entries
-from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S, DEFAULT_PREVIEW_S
+from tlf_env.task.scenario import DEFAULT_PREVIEW_S
+from tlf_env.task.sources import DEFAULT_CONTROL_PERIOD_S
 
 
 @driver

@@ -16,6 +16,7 @@ from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Whole
 from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
 from tlf_env.task.scenario import Scenario, scenario_with
+from tlf_env.task.sources import BASE
 
 Count = Annotated[Whole, Field(ge=1)]
 SeedsFromTo = tuple[
@@ -79,7 +80,7 @@ class TrainConfig(Frozen):
     scenario: dict[str, Any] = {}  # scenario fields of every task
     tasks: Annotated[
         dict[str, dict[str, Any]], Field(min_length=1)
-    ]  # task: its own scenario fields
+    ]  # task: its own scenario fields; with `base`, the task is a new one, built on that
     disturbances: Annotated[
         dict[str, NonNegative], Field(min_length=1)
     ]  # preset or file: share of episodes; also PRESET@LEVEL, as ice@1.3
@@ -178,15 +179,23 @@ class TrainConfig(Frozen):
     def _scenario(self, task: str, disturbance: str, level: float | None, **more: Any) -> Scenario:
         """A task's scenario; an error names the place of the key in the configuration."""
         own = self.tasks[task]
+        source = {"name": task, BASE: own[BASE]} if BASE in own else task
+        own = {field: value for field, value in own.items() if field != BASE}
         disturbance, own_level = level_of(disturbance)
         if own_level is not None:
             level = own_level if level is None else own_level * level
         fields = {**self.scenario, "plant": "batch", **own, **more, "disturbance": disturbance}
         try:
-            return scenario_with(task, fields, level)
+            return scenario_with(source, fields, level)
         except ValueError as error:
             key = re.split(r"[.:\s]", str(error), maxsplit=1)[0]
-            place = f"tasks.{task}." if key in own else "scenario." if key in self.scenario else ""
+            place = (
+                f"tasks.{task}."
+                if key in self.tasks[task]
+                else "scenario."
+                if key in self.scenario
+                else ""
+            )
             raise ValueError(f"{place}{error}") from error
 
 
@@ -199,8 +208,12 @@ def level_of(disturbance: str) -> tuple[str, float | None]:
         return disturbance, None
 
 
-def _place_disturbances(data: dict[str, Any], folder: Path) -> None:
-    """Replace the disturbances' files in the configuration's folder by their paths."""
+def _place_files(data: dict[str, Any], folder: Path) -> None:
+    """Replace the files in the configuration's folder, of disturbances and bases, by their paths."""
+    tasks = data.get("tasks")
+    for own in tasks.values() if isinstance(tasks, dict) else ():
+        if isinstance(own, dict) and BASE in own:
+            own[BASE] = beside(folder, own[BASE])
     for place in (data, data.get("evaluation")):
         if isinstance(place, dict) and "disturbances" in place:
             place["disturbances"] = beside(folder, place["disturbances"])
@@ -219,7 +232,7 @@ def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> Tra
     else:
         data = read_preset_or_file("training", source)
         if is_file_name(source):
-            _place_disturbances(data, Path(source).parent)
+            _place_files(data, Path(source).parent)
     data |= {name: value for name, value in overrides.items() if value is not None}
     try:
         return TrainConfig.model_validate(data)

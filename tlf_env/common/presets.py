@@ -196,6 +196,11 @@ def is_file_name(source: str | Path) -> bool:
     return Path(source).suffix.lower() in SUFFIXES
 
 
+def is_path_file(source: str | Path) -> bool:
+    """Whether a source names a CSV file, a path of waypoints."""
+    return Path(source).suffix.lower() == ".csv"
+
+
 def preset_or_file(kind: str, source: str) -> Path | None:
     """Where a preset or the YAML file that a source names lies; None if it is neither's name."""
     if source in preset_names(kind):
@@ -204,7 +209,7 @@ def preset_or_file(kind: str, source: str) -> Path | None:
 
 
 def beside(folder: Path, named: Any) -> Any:
-    """What a file in a folder names, with the paths of the YAML files that lie in the folder.
+    """What a file in a folder names, with the paths of the YAML and CSV files that lie in the folder.
 
     A relative path starts at the folder, or at the working directory if there is no such file in the folder.
     ``named`` is a name, a list of names or a mapping by names; all else is returned as it is.
@@ -213,7 +218,7 @@ def beside(folder: Path, named: Any) -> Any:
         return [beside(folder, one) for one in named]
     if isinstance(named, dict):
         return {beside(folder, one): value for one, value in named.items()}
-    if not isinstance(named, str) or not is_file_name(named):
+    if not isinstance(named, str) or not (is_file_name(named) or is_path_file(named)):
         return named
     path = folder / named
     return str(path) if path.is_file() else named

@@ -188,6 +188,12 @@ name), a file or a mapping. `env.scenario` contains everything that determines a
 each of its fields is a keyword argument. An unknown keyword is a `TypeError`, an unknown key in a file or a
 mapping a `ValueError`; both name the key with its path and, if there is one, the nearest name.
 
+A file or mapping with `base: infinity` is that scenario with the changes that follow: mappings are merged,
+all else is replaced. A disturbance has `base`, too, as in
+`disturbance: {base: slip, slip: {delta_1_mm_s: 40}}`. `trajectory` may be the name or file of another
+scenario, whose trajectory it takes, or a CSV file of waypoints. Files that a file names lie in its own folder
+or in the working directory.
+
 In YAML files numbers are decimal (`12`, `-0.5`, `5e-1`), and only `true` and `false` are switches (YAML 1.2).
 Words and numbers that YAML 1.1 reads otherwise (`yes`, `no`, `on`, `off`, `010`, `0x1F`, `1_000`, `1:30`, a
 date) are refused unless they are quoted; a quoted value is a text and never a number. In Python a number is

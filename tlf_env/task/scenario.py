@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import functools
 import math
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal, NoReturn, Self
@@ -29,7 +28,7 @@ from tlf_env.common.models import (
     Whole,
     is_number,
 )
-from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
+from tlf_env.common.presets import is_file_name, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for
 from tlf_env.onboard.estimator import EkfParameters
@@ -67,11 +66,17 @@ from tlf_env.task.feasibility import (
 )
 from tlf_env.task.observation import Entry
 from tlf_env.task.reward import DEFAULT_WEIGHTS, RewardTerms, least_reward
+from tlf_env.task.sources import (
+    DEFAULT_CONTROL_PERIOD_S,
+    disturbance_data,
+    merged,
+    scenario_data,
+    trajectory_data,
+)
 from tlf_env.task.trajectories import Trajectory
-from tlf_env.task.waypoints import MAX_MAGNITUDE, scenario_of_waypoints
+from tlf_env.task.waypoints import MAX_MAGNITUDE
 
 MAX_ROBOTS = 1000
-DEFAULT_CONTROL_PERIOD_S = 0.02
 DEFAULT_PREVIEW_S = (0.5, 1.0)
 BROADCAST_SMOOTHING_S = 0.1  # by default, where there is room
 SETTLE_FRACTION = 0.4
@@ -91,8 +96,6 @@ OTHER_NAMES = {
     "num_envs": "use formations",
     "seed": "reset() takes the seed",
 }
-NAMES_A_FILE = ("disturbance", "world")  # fields that may name a file, also beside the scenario's
-NOT_IN_NAMES = re.compile(r"^[^\w]+|[^\w.+-]")
 
 EndCondition = Literal["lost", "touched"]
 
@@ -119,17 +122,6 @@ class FrozenDict(dict[str, float]):
 
     def __reduce__(self) -> tuple[Any, ...]:
         return FrozenDict, (dict(self),)
-
-
-def _named_disturbance(source: str | Path) -> dict[str, Any]:
-    """A disturbance preset or file, with the name that it has by its source."""
-    found = read_preset_or_file("disturbance", source, ", nor a mapping")
-    if list(found) == ["disturbance"]:
-        raise ValueError(
-            f"{path_text(source)} has the key disturbance; a disturbance's file has its channels at the top"
-        )
-    name = name_of(Path(source)) if is_file_name(source) else str(source)
-    return {"name": name, **found}
 
 
 def whole_steps(duration_s: float, period_s: float) -> int | None:
@@ -232,7 +224,12 @@ class Scenario(Frozen):
     @field_validator("disturbance", mode="before")
     @classmethod
     def _disturbance_of_a_file(cls, value: Any) -> Any:
-        return _named_disturbance(value) if isinstance(value, str | Path) else value
+        return disturbance_data(value) if isinstance(value, str | Path | Mapping) else value
+
+    @field_validator("trajectory", mode="before")
+    @classmethod
+    def _trajectory_of_a_file(cls, value: Any) -> Any:
+        return trajectory_data(value) if isinstance(value, str | Path) else value
 
     @field_validator("limiter", mode="before")
     @classmethod
@@ -592,8 +589,7 @@ def _says_action(source: Any, control_period_s: Any) -> bool:
         return True
     if isinstance(source, Sequence) and not isinstance(source, str):
         return any(_says_action(one, control_period_s) for one in source)
-    given = source if isinstance(source, Mapping) else _read_source(source, control_period_s)
-    return given.get("action") is not None
+    return scenario_data(source, control_period_s).get("action") is not None
 
 
 def scenario_with(
@@ -615,13 +611,14 @@ def scenario_with(
             for key, value in source.model_dump().items()
             if key in source.model_fields_set
         }
-    elif isinstance(source, Mapping):
-        data = dict(source)
     else:
-        data = _read_source(source, fields.get("control_period_s"))
+        data = scenario_data(source, fields.get("control_period_s"))
     for key, value in fields.items():
         if value is not None:
-            data[key] = _merged(data.get(key), value)
+            old = data.get(key)
+            if key == "trajectory" and isinstance(old, str | Path) and isinstance(value, Mapping):
+                old = trajectory_data(old)
+            data[key] = merged(old, value)
     named = data.get("disturbance")
     if disturbance_level is not None:
         data["disturbance"] = _with_level(data.get("disturbance", {}), disturbance_level)
@@ -634,29 +631,6 @@ def scenario_with(
             if line.startswith("disturbance") and file not in line:
                 line = f"{file}, {line}"
         raise ValueError(line) from error
-
-
-def _read_source(source: str | Path, control_period_s: Any) -> dict[str, Any]:
-    if not isinstance(source, str | Path):
-        raise ValueError(
-            f"scenario {shown(source)} must be a preset's name, a file, a mapping or a Scenario"
-        )
-    path = Path(source)
-    if path.suffix.lower() == ".csv":
-        given = is_number(control_period_s) and 0 < control_period_s < math.inf
-        found = scenario_of_waypoints(
-            path, float(control_period_s) if given else DEFAULT_CONTROL_PERIOD_S
-        )
-        return {**found, "name": name_of(path)}
-    found = read_preset_or_file("scenario", source, ", nor a .csv file of waypoints")
-    if is_file_name(source):
-        found |= {key: beside(path.parent, found[key]) for key in NAMES_A_FILE if key in found}
-    return {"name": name_of(path) if is_file_name(source) else str(source), **found}
-
-
-def name_of(path: Path) -> str:
-    """The name of a scenario from its file's name; characters that are not allowed become ``_``."""
-    return NOT_IN_NAMES.sub("_", path.stem)[:100]
 
 
 @functools.lru_cache(maxsize=64)
@@ -796,21 +770,15 @@ def _robot_with(base: Any, differences: Mapping[str, Any]) -> Any:
     if isinstance(base, Mapping) and differences.get("outline_polygon_mm") is not None:
         around = ("outline_radius_mm", "outline_offset_mm")
         base = {name: value for name, value in base.items() if name not in around}
-    return _merged(base, differences)
-
-
-def _merged(old: Any, new: Any) -> Any:
-    if isinstance(old, Mapping) and isinstance(new, Mapping) and "type" not in new:
-        return {**old, **{key: _merged(old.get(key), value) for key, value in new.items()}}
-    return new
+    return merged(base, differences)
 
 
 def _with_level(disturbance: Any, level: float) -> dict[str, Any]:
-    if isinstance(disturbance, str | Path):
-        disturbance = _named_disturbance(disturbance)
+    if isinstance(disturbance, str | Path | Mapping):
+        disturbance = disturbance_data(disturbance)
     elif isinstance(disturbance, Disturbance):
         disturbance = disturbance.model_dump()
-    elif not isinstance(disturbance, Mapping):
+    else:
         raise ValueError(f"disturbance: Input should be a mapping, got {shown(disturbance)}")
     if not is_number(level) or not 0 <= level < math.inf:
         raise ValueError(f"disturbance_level {shown(level)} must be a finite number, at least 0")

@@ -24,7 +24,7 @@ from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries
-from tlf_env.task.scenario import DEFAULT_CONTROL_PERIOD_S
+from tlf_env.task.sources import DEFAULT_CONTROL_PERIOD_S
 
 
 class ErrorBounds(Frozen):
