@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+from collections.abc import Callable
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -34,36 +35,108 @@ BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
 
 app = typer.Typer(
     help="Time-gap leader-follower formations of wheeled robots that slip.",
-    add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
 )
 
 
+def completed(kind: str) -> Callable[[str], list[str]]:
+    """Completes the names of a kind of :data:`~baselines.commands.catalogue.KINDS` in a shell."""
+
+    def matching(incomplete: str) -> list[str]:
+        from baselines.commands.catalogue import catalogue
+
+        return [name for name in catalogue(kind)[kind] if name.startswith(incomplete)]
+
+    return matching
+
+
+def print_version(wanted: bool) -> None:
+    """Print the version and end, if it is wanted."""
+    if wanted:
+        from importlib.metadata import version
+
+        typer.echo(f"tlf_env {version('tlf-env')}")
+        raise typer.Exit
+
+
+@app.callback()
+def everywhere(
+    version: Annotated[
+        bool,
+        typer.Option("--version", help="Print the version.", is_eager=True, callback=print_version),
+    ] = False,
+) -> None:
+    """Time-gap leader-follower formations of wheeled robots that slip."""
+
+
+@app.command("list")
+def list_(
+    kind: Annotated[
+        str | None,
+        typer.Argument(help="tasks, disturbances, policies, ...; all kinds if it is left out."),
+    ] = None,
+    as_json: Annotated[bool, typer.Option("--json", help="Print the names as JSON.")] = False,
+) -> None:
+    """List what can be named: tasks, disturbances, policies, estimators, trainings, plans, ..."""
+    from baselines.commands.catalogue import catalogue, print_catalogue
+
+    found = catalogue(kind)
+    if as_json:
+        typer.echo(json.dumps(found, indent=1, ensure_ascii=False))
+    else:
+        print_catalogue(found)
+
+
+SCENARIO = typer.Argument(
+    help="Preset (see `tlf list tasks`), YAML file, CSV file of waypoints t_s,x_mm,y_mm, or -: YAML from the "
+    "standard input.",
+    autocompletion=completed("tasks"),
+)
+DISTURBANCE = typer.Option(
+    help="Disturbance: a preset (see `tlf list disturbances`) or FILE.yaml.",
+    autocompletion=completed("disturbances"),
+)
+LEVEL = typer.Option(help="Factor on the disturbance's deviation from nominal.")
+SETTINGS = typer.Option(
+    "--set",
+    help="PATH=VALUE: set a field of the scenario, e.g. time_gap_s=3 or disturbance.slip.delta_1_mm_s=20; may "
+    "be repeated. `tlf show SCENARIO` prints all fields.",
+    metavar="PATH=VALUE",
+)
+
+
+@app.command()
+def show(
+    scenario: Annotated[str, SCENARIO],
+    disturbance: Annotated[str | None, DISTURBANCE] = None,
+    level: Annotated[float | None, LEVEL] = None,
+    settings: Annotated[list[str] | None, SETTINGS] = None,
+    changes: Annotated[
+        bool, typer.Option("--changes", help="Print only what differs from the defaults.")
+    ] = False,
+) -> None:
+    """Print a scenario as YAML: `tlf show infinity > own.yaml`, or `tlf show infinity | tlf run -`."""
+    from baselines.commands.scenarios import asked_scenario, shown_scenario
+
+    chosen = asked_scenario(scenario, {"disturbance": disturbance}, level, settings or ())
+    typer.echo(str(chosen) if changes else shown_scenario(chosen), nl=False)
+
+
 @app.command()
 def run(
-    scenario: Annotated[
-        str,
-        typer.Argument(
-            help="Preset (infinity, flower), YAML file, or CSV file of waypoints t_s,x_mm,y_mm."
-        ),
-    ],
-    disturbance: Annotated[
-        str | None,
-        typer.Option(
-            help="Disturbance: nominal, none, noise, slip, ice, start, payload, ..., or FILE.yaml."
-        ),
-    ] = None,
-    level: Annotated[
-        float | None, typer.Option(help="Factor on the disturbance's deviation from nominal.")
-    ] = None,
+    scenario: Annotated[str, SCENARIO],
+    disturbance: Annotated[str | None, DISTURBANCE] = None,
+    level: Annotated[float | None, LEVEL] = None,
+    settings: Annotated[list[str] | None, SETTINGS] = None,
     policy: Annotated[
         str,
         typer.Option(
+            autocompletion=completed("policies"),
             help="reference[:GAINS], reference:FILE.yaml, pure_pursuit, feedback_linearisation, kanayama, "
             "lqr, sliding_mode, adrc, nmpc, CONTROLLER+ESTIMATOR+LIMITER of these (e.g. "
             "kanayama+ekf-slip+body), the name of a shipped policy, FILE.safetensors (with FILE.json), "
-            "module:factory; with --trust FILE.zip and entry:FOLDER (a competition's entry)."
+            "module:factory; with --trust FILE.zip and entry:FOLDER (a competition's entry).",
         ),
     ] = "reference",
     gains: Annotated[
@@ -118,25 +191,29 @@ def run(
     ] = False,
 ) -> None:
     """Run a policy in a scenario to its horizon; write table, summary, data and figures."""
+    from baselines.commands.scenarios import asked_scenario
     from baselines.policies.registry import describe_overrides, fit_policy
     from baselines.runs.files import summary, write_mat, write_record
     from baselines.runs.run import run_policy
     from baselines.tables import metrics_table
     from tlf_env.numerics.philox import checked_seed
-    from tlf_env.task.scenario import load_scenario, scenario_notes
+    from tlf_env.task.scenario import scenario_notes
     from tlf_env.task.start import start_options
 
-    chosen = load_scenario(
+    chosen = asked_scenario(
         scenario,
-        disturbance=disturbance,
-        disturbance_level=level,
-        robots=robots,
-        plant=plant,
-        estimator=estimator,
-        wheel_loop=wheel_loop,
-        observer=observer,
-        control_period_s=control_period_s,
-        horizon_s=horizon_s,
+        {
+            "disturbance": disturbance,
+            "robots": robots,
+            "plant": plant,
+            "estimator": estimator,
+            "wheel_loop": wheel_loop,
+            "observer": observer,
+            "control_period_s": control_period_s,
+            "horizon_s": horizon_s,
+        },
+        level,
+        settings or (),
     )
     checked_seed(seed)
     options: dict[str, Any] = {} if phase_s is None else {"phase_s": phase_s}
@@ -367,8 +444,8 @@ def bench(
         str | None,
         typer.Option(
             help="Read policies, tasks, disturbances, also, seeds, level, sweep, horizon and plant from a "
-            "plan: board, controllers, crossing, crossing-slow, unseen or FILE.yaml; command-line options "
-            "take precedence.",
+            "plan: a preset (see `tlf list plans`) or FILE.yaml; command-line options take precedence.",
+            autocompletion=completed("plans"),
             is_eager=True,
             callback=take_plan,
         ),
@@ -406,7 +483,7 @@ def bench(
     if entry:
         names = (*(names if given(ctx, "policies") else ()), *(f"entry:{one}" for one in entry))
     if envelope:
-        from baselines.envelope_command import bench_envelope
+        from baselines.commands.envelope import bench_envelope
 
         bench_envelope(ctx, names)
         return
@@ -535,7 +612,8 @@ def train(
     config: Annotated[
         str,
         typer.Argument(
-            help="Training: scratch, from-nothing, residual, quick, sac, recurrent, or a YAML file."
+            help="Training: a preset (see `tlf list trainings`) or a YAML file.",
+            autocompletion=completed("trainings"),
         ),
     ],
     seeds: Annotated[str, typer.Option(help="Training seeds, comma-separated.")] = "0",
@@ -561,12 +639,12 @@ def train(
     from baselines.training.config import load_config
     from baselines.training.curve import kept_evaluation
 
+    loaded = load_config(config, robot_steps=robot_steps)
+    numbers = whole_numbers("seeds", seeds)
     try:
         from baselines.training.train_seeds import train_seeds
     except ModuleNotFoundError as error:
         raise ValueError(f"training needs {error.name} (pip install 'tlf-env[train]')") from error
-    loaded = load_config(config, robot_steps=robot_steps)
-    numbers = whole_numbers("seeds", seeds)
     name = Path(config).stem
     folder = writable_folder(out or Path("results/train") / name)
     warn_of_scenarios(loaded.named_scenarios())
@@ -601,7 +679,11 @@ def train(
 @app.command()
 def tune(
     config: Annotated[
-        str, typer.Argument(help="Search: a preset (tuned, or a law) or a YAML file.")
+        str,
+        typer.Argument(
+            help="Search: a preset (see `tlf list searches`) or a YAML file.",
+            autocompletion=completed("searches"),
+        ),
     ],
     trials: Annotated[
         int | None, typer.Option(help="Number of trials, including those of earlier calls.")
@@ -659,7 +741,7 @@ def compile_(
     ] = False,
 ) -> None:
     """Compile the step drivers ahead of the first run, on two cores; nothing is done twice."""
-    from baselines.compile_command import ALL, USUAL, compile_drivers
+    from baselines.commands.compile import ALL, USUAL, compile_drivers
 
     compile_drivers(ALL if everything else USUAL)
 

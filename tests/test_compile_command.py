@@ -14,8 +14,9 @@ from multiprocessing.connection import Connection
 import numpy as np
 import pytest
 
-from baselines import cli, compile_command
-from baselines.compile_command import Share
+from baselines import cli
+from baselines.commands import compile as compile_command
+from baselines.commands.compile import Share
 from tlf_env import BatchPlant
 from tlf_env.numerics.compiled import cache_folder
 

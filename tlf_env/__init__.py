@@ -56,7 +56,22 @@ def __getattr__(name: str) -> Any:
 
 _PETTINGZOO_HAS_IDS = hasattr(pettingzoo, "register")  # from 1.27 on
 
-for _task in ("infinity", "flower"):
+# Written out, as reading the folder of presets would slow down every import.
+TASKS = (
+    "circle",
+    "corridor",
+    "crossing_traffic",
+    "flower",
+    "infinity",
+    "infinity_from_rest",
+    "infinity_hardware",
+    "long_circle",
+    "mixed",
+    "slalom_posts",
+    "stop_and_go",
+    "warehouse",
+)
+for _task in TASKS:
     if _PETTINGZOO_HAS_IDS:
         for _kind in ("parallel", "aec"):
             pettingzoo.register(
@@ -66,7 +81,7 @@ for _task in ("infinity", "flower"):
                 kwargs={"scenario": _task},
             )
     gymnasium.register(
-        f"tlf_env/{_task.capitalize()}-v0",
+        f"tlf_env/{_task.title().replace('_', '')}-v0",
         "tlf_env.envs.single:FormationEnv",
         vector_entry_point="tlf_env.envs.vector:FormationVectorEnv",
         kwargs={"scenario": _task},

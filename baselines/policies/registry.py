@@ -25,6 +25,7 @@ from baselines.policies.systems import (
     system_controllers,
 )
 from tlf_env.common.digest import code_of
+from tlf_env.common.errors import suggestion
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 from tlf_env.onboard.parts import Policy, load_part, make_part
 from tlf_env.task.actions import ACTION_SIZE
@@ -231,9 +232,10 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         return make_law(head, tail, scenario)
     if tail:
         return make_part("policy", name, load_part(name))
-    names = ", ".join([*policy_names(), *shipped_policies()])
+    names = [*policy_names(), *shipped_policies()]
     raise ValueError(
-        f"policy {name!r} is not one of {names}, FILE{WEIGHTS}, module:factory, FILE.zip, {ENTRY}FOLDER"
+        f"policy {name!r} is not one of {', '.join(names)}, FILE{WEIGHTS}, module:factory, FILE.zip, "
+        f"{ENTRY}FOLDER{suggestion(name, names)}"
     )
 
 

@@ -24,6 +24,7 @@ PLAINLY = {"dictionary": "mapping", "tuple": "list", "string": "text"}
 PYDANTICS = re.compile(
     r"valid (dictionary|tuple|string)(?: or (?:instance of \w+|object to extract fields from))?"
 )
+QUOTED = re.compile(r"'([^']+)'")  # an allowed name in pydantic's message
 MOST_ERRORS = 6  # named in a line
 MOST_COMPARED = 200  # errors of one validation that are compared with each other
 CLOSENESS = 0.7  # of two names, from 0 to 1, above which one suggests the other
@@ -265,4 +266,6 @@ def _message(one: _Found, message: str, hints: Mapping[str, str]) -> str:
         message = f"unknown key{nearest(one.keys[-1], one.allowed, others)}"
     elif one.item["type"] not in COMPLETE and not isinstance(value, dict | list):
         message += f", got {shown(value)}"
+        if "did you mean" not in message:
+            message += suggestion(value, QUOTED.findall(message.partition(", got ")[0]))
     return f"{location}: {message}" if location else message

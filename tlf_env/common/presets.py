@@ -7,6 +7,7 @@ unless it is quoted, as it means a number or a switch to one reader and a name t
 
 from __future__ import annotations
 
+import itertools
 import re
 from pathlib import Path
 from typing import Any
@@ -41,6 +42,7 @@ MOST_VALUES = (
 )
 DECIMAL = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
+SENTENCE_END = re.compile(r"(?<=\.) (?=[A-Z`]|docs/)")
 BREAKS = re.compile("[\x85\u2028\u2029]")
 AMBIGUOUS = "!ambiguous"  # tag of the values that YAML 1.1 and 1.2 read differently
 SCALARS = {
@@ -160,18 +162,32 @@ def read_yaml(path: Path) -> dict[str, Any]:
     """
     name = path_text(path)
     try:
-        data = yaml.load(path.read_text(encoding="utf-8"), _Loader)
+        data = parsed_yaml(path.read_text(encoding="utf-8"), name)
     except OSError as error:
         raise ValueError(f"cannot read {name}: {error.strerror}") from error
+    except UnicodeDecodeError as error:
+        raise ValueError(f"{name} is not YAML: {' '.join(str(error).split())}") from error
+    if not isinstance(data, dict):
+        raise ValueError(f"{name} must contain a mapping, got {type(data).__name__}")
+    return data
+
+
+def parsed_yaml(text: str, name: str) -> Any:
+    """The value that a YAML text stands for; ``name`` is its source in errors.
+
+    Raises
+    ------
+    ValueError
+        in one line, as :func:`read_yaml`, but for a value of any kind.
+    """
+    try:
+        return yaml.load(text, _Loader)
     except (RepeatedKeyError, AmbiguousValueError, RepetitionError) as error:
         raise ValueError(f"{name}, {error}") from error
     except RecursionError as error:
         raise ValueError(f"{name} is nested more than {MOST_LEVELS} levels deep") from error
     except (yaml.YAMLError, ValueError) as error:
         raise ValueError(f"{name} is not YAML: {' '.join(str(error).split())}") from error
-    if not isinstance(data, dict):
-        raise ValueError(f"{name} must contain a mapping, got {type(data).__name__}")
-    return data
 
 
 def yaml_text(data: Any) -> str:
@@ -189,6 +205,19 @@ def presets_folder(kind: str = "scenario") -> Path:
 def preset_names(kind: str = "scenario") -> list[str]:
     """Sorted names of the presets of a kind."""
     return sorted(path.stem for path in presets_folder(kind).glob("*.yaml"))
+
+
+def preset_summary(kind: str, name: str) -> str:
+    """The first sentence of the comment at the top of a preset's file."""
+    lines = (presets_folder(kind) / f"{name}.yaml").read_text(encoding="utf-8").splitlines()
+    comment = itertools.takewhile(lambda line: line.startswith("#"), lines)
+    return first_sentence(" ".join(line.lstrip("# ") for line in comment))
+
+
+def first_sentence(text: str) -> str:
+    """The first sentence of a text, or its first paragraph if that ends before."""
+    paragraph = " ".join(text.partition("\n\n")[0].split())
+    return SENTENCE_END.split(paragraph, maxsplit=1)[0]
 
 
 def is_file_name(source: str | Path) -> bool:

@@ -56,6 +56,7 @@ from tlf_env.task.actions import (
     ActionKind,
     action_entries,
 )
+from tlf_env.task.display import differences_text
 from tlf_env.task.feasibility import (
     disturbed,
     push_warnings,
@@ -71,6 +72,7 @@ from tlf_env.task.sources import (
     disturbance_data,
     merged,
     scenario_data,
+    set_field,
     trajectory_data,
 )
 from tlf_env.task.trajectories import Trajectory
@@ -388,6 +390,10 @@ class Scenario(Frozen):
                 "plant 'chipmunk' moves one formation at a time; 'batch' and 'kinematic' can run in a batch"
             )
 
+    def __str__(self) -> str:
+        """What differs from the defaults, as YAML."""
+        return differences_text(self)
+
     @property
     def robot_count(self) -> int:
         """Number of robots."""
@@ -596,13 +602,20 @@ def scenario_with(
     source: str | Path | Mapping[str, Any] | Scenario,
     fields: Mapping[str, Any],
     disturbance_level: float | None = None,
+    settings: Mapping[str, Any] | None = None,
 ) -> Scenario:
     """A scenario as :func:`load_scenario`, its fields from a mapping, for example from a file.
+
+    Parameters
+    ----------
+    settings
+        Values of fields by their paths, as ``disturbance.slip.delta_1_mm_s``, set in this order after
+        ``fields``; each field alone, without merging.
 
     Raises
     ------
     ValueError
-        as :func:`load_scenario`; for an unknown key in ``fields``, too.
+        as :func:`load_scenario`; for an unknown key in ``fields``, too, and as :func:`set_field`.
     """
     if isinstance(source, Scenario):
         # A field that is left at its default may still be set, for example by what a policy asks for.
@@ -620,6 +633,8 @@ def scenario_with(
                 old = trajectory_data(old)
             data[key] = merged(old, value)
     named = data.get("disturbance")
+    for path, value in (settings or {}).items():
+        set_field(data, path, value)
     if disturbance_level is not None:
         data["disturbance"] = _with_level(data.get("disturbance", {}), disturbance_level)
     try:

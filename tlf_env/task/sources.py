@@ -14,6 +14,7 @@ from typing import Any
 from tlf_env.common.errors import path_text, shown
 from tlf_env.common.models import is_number
 from tlf_env.common.presets import beside, is_file_name, is_path_file, read_preset_or_file
+from tlf_env.onboard.limiters import load_limiter
 from tlf_env.task.waypoints import read_points, scenario_of_waypoints
 
 DEFAULT_CONTROL_PERIOD_S = 0.02
@@ -142,3 +143,57 @@ def _disturbance_alone(source: Any) -> dict[str, Any]:
     if BASE in found:
         found[BASE] = beside(path.parent, found[BASE])
     return {"name": name_of(path), **found}
+
+
+def set_field(data: dict[str, Any], path: str, value: Any) -> None:
+    """Set one field of a scenario's plain data by its path, as ``disturbance.slip.delta_1_mm_s``.
+
+    What a path leads through may be missing, or may be a name: the named disturbance, trajectory, world or
+    limiter is then put in its place. The number of an entry leads into a list (``robots.0.mass_kg``).
+
+    Raises
+    ------
+    ValueError
+        for a path through a value that has no parts, or an entry that a list does not have.
+    """
+    keys = path.split(".")
+    if not all(keys):
+        raise ValueError(
+            f"{shown(path)} must be a field, as time_gap_s, or a path of them with dots"
+        )
+    part: Any = data
+    for depth, key in enumerate(keys[:-1]):
+        inner = _entry(part, key, path)
+        if isinstance(inner, str) and depth == 0 and key in NAMED:
+            inner = NAMED[key](inner)
+        inner = {} if inner is None else inner
+        if not isinstance(inner, Mapping | list | tuple):
+            place = ".".join(keys[: depth + 1])
+            raise ValueError(f"{path}: {place} is {shown(inner)}, which has no parts")
+        # Copied, as it may belong to the caller.
+        part = _put(part, key, dict(inner) if isinstance(inner, Mapping) else list(inner))
+    _entry(part, keys[-1], path)
+    _put(part, keys[-1], value)
+
+
+def _entry(part: Any, key: str, path: str) -> Any:
+    """What a mapping or a list holds at a key; None for a key that a mapping does not have."""
+    if isinstance(part, dict):
+        return part.get(key)
+    if not key.isdecimal() or int(key) >= len(part):
+        raise ValueError(f"{path}: {shown(key)} must be a number from 0 to {len(part) - 1}")
+    return part[int(key)]
+
+
+def _put(part: Any, key: str, value: Any) -> Any:
+    part[key if isinstance(part, dict) else int(key)] = value
+    return value
+
+
+# Fields that may be a name, and what gives the mapping that the name stands for.
+NAMED: dict[str, Callable[[str], dict[str, Any]]] = {
+    "disturbance": disturbance_data,
+    "trajectory": trajectory_data,
+    "world": lambda name: read_preset_or_file("world", name, ", nor a mapping"),
+    "limiter": lambda name: load_limiter(name).model_dump(),
+}
