@@ -175,9 +175,19 @@ def run(
         ),
     ] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the results; default results/SCENARIO.")
+        Path | None,
+        typer.Option(
+            help="Folder of the results; default results/SCENARIO-POLICY-DISTURBANCE-SEED, with some digits "
+            "where anything else is not as in the presets."
+        ),
     ] = None,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace another run that is in the folder --out.")
+    ] = False,
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    parquet: Annotated[
+        bool, typer.Option("--parquet", help="Write trajectory.parquet, too (needs pyarrow).")
+    ] = False,
     mat: Annotated[bool, typer.Option("--mat", help="Write trajectory.mat, too.")] = False,
     trust: Annotated[
         bool,
@@ -191,57 +201,39 @@ def run(
     ] = False,
 ) -> None:
     """Run a policy in a scenario to its horizon; write table, summary, data and figures."""
+    from baselines.commands.run import Wanted, run_command
     from baselines.commands.scenarios import asked_scenario
-    from baselines.policies.registry import describe_overrides, fit_policy
-    from baselines.runs.files import summary, write_mat, write_record
-    from baselines.runs.run import run_policy
-    from baselines.tables import metrics_table
-    from tlf_env.numerics.philox import checked_seed
-    from tlf_env.task.scenario import scenario_notes
-    from tlf_env.task.start import start_options
 
-    chosen = asked_scenario(
-        scenario,
-        {
-            "disturbance": disturbance,
-            "robots": robots,
-            "plant": plant,
-            "estimator": estimator,
-            "wheel_loop": wheel_loop,
-            "observer": observer,
-            "control_period_s": control_period_s,
-            "horizon_s": horizon_s,
-        },
-        level,
-        settings or (),
-    )
-    checked_seed(seed)
+    fields = {
+        "disturbance": disturbance,
+        "robots": robots,
+        "plant": plant,
+        "estimator": estimator,
+        "wheel_loop": wheel_loop,
+        "observer": observer,
+        "control_period_s": control_period_s,
+        "horizon_s": horizon_s,
+    }
     options: dict[str, Any] = {} if phase_s is None else {"phase_s": phase_s}
     if poses is not None:
         options["poses"] = start_poses(poses)
-    start_options(options, chosen.robot_count)
-    name = named_policy(policy, gains)
-    driver, chosen, overrides = fit_policy(name, chosen, trust=trust)
-    if overrides:
-        fields = ", ".join(describe_overrides(overrides))
-        notes.print(f"tlf: note: {name} asks for {fields}", soft_wrap=True)
-    warn_of_scenarios([(chosen.name, chosen)])
-    for line in scenario_notes(chosen):
-        notes.print(f"tlf: note: {line}", soft_wrap=True)
-    folder = writable_folder(out or Path("results") / chosen.name)
-    warn_of_compiling()
-    with progress_bar(f"{chosen.name}, {name}") as update:
-        record = run_policy(chosen, driver, seed, name=name, options=options, progress=update)
-    written = write_record(record, folder)
-    if mat:
-        written.append(write_mat(record, folder))
-    if figures:
-        written += draw(record, folder)
-    if as_json:
-        typer.echo(json.dumps(summary(record), indent=2, allow_nan=False))
-        return
-    screen.print(metrics_table(record))
-    screen.print(f"In {folder}: {', '.join(path.name for path in written)}", soft_wrap=True)
+    finished = run_command(
+        asked_scenario(scenario, fields, level, settings or ()),
+        named_policy(policy, gains),
+        seed,
+        options,
+        Wanted(
+            out=out,
+            overwrite=overwrite,
+            figures=figures,
+            mat=mat,
+            parquet=parquet,
+            as_json=as_json,
+        ),
+        trust=trust,
+    )
+    if not finished:
+        raise SystemExit(INTERRUPTED)
 
 
 def start_poses(text: str) -> list[list[float]]:
@@ -273,16 +265,6 @@ def named_policy(policy: str, gains: str | None) -> str:
     if gains is not None:
         raise ValueError(f"--gains {gains} needs --policy reference, got {policy!r}")
     return policy
-
-
-def draw(record: Any, folder: Path) -> list[Path]:
-    """The figures of a run; none, and a note, if matplotlib is missing."""
-    try:
-        from baselines.runs.figures import write_figures
-    except ModuleNotFoundError as error:
-        warn_of_missing(error)
-        return []
-    return write_figures(record, folder)
 
 
 @app.command()

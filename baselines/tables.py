@@ -10,6 +10,18 @@ from rich.table import Table
 from baselines.benchmark.page import policy_label
 from baselines.runs.run import Record
 from baselines.training.curve import kept_evaluation
+from tlf_env.task.metrics import RobotMetrics
+
+
+RUN_COLUMNS: tuple[tuple[str, str, int], ...] = (
+    ("position RMS\nmm", "position_rmse_mm", 2),
+    ("largest\nmm", "position_max_mm", 1),
+    ("formation RMS\nmm", "formation_rmse_mm", 1),
+    ("heading RMS\nrad", "heading_rmse_rad", 4),
+    ("time gap RMS\ns", "time_gap_rmse_s", 4),
+    ("torque at limit\n% of time", "saturation_fraction", 1),
+    ("largest slip\nmm/s", "slip_max_mm_s", 1),
+)
 
 
 def metrics_table(record: Record) -> Table:
@@ -18,34 +30,33 @@ def metrics_table(record: Record) -> Table:
     table = Table(
         title=f"{scenario.name}, {record.policy}, disturbance {scenario.disturbance.name}, "
         f"seed {record.seed}",
-        caption=f"errors from {scenario.settle_s:g} s on (form: from 5 s after the robot's gap); "
-        "pos: to the robot's own reference, form: to the leader's path, one gap later per robot",
+        caption=f"Errors from {scenario.settle_s:g} s on (formation: from 5 s after the robot sets out). Position: "
+        "to the robot's own reference. Formation: to the leader's path, one time gap later for each robot.",
         box=SIMPLE_HEAD,
         collapse_padding=True,
         pad_edge=False,
     )
-    columns: list[tuple[str, str, int]] = [
-        ("pos RMS\nmm", "position_rmse_mm", 2),
-        ("max\nmm", "position_max_mm", 1),
-        ("form RMS\nmm", "formation_rmse_mm", 1),
-        ("head RMS\nrad", "heading_rmse_rad", 4),
-        ("gap RMS\ns", "time_gap_rmse_s", 4),
-        ("at limit\n%", "saturation_fraction", 1),
-        ("slip max\nmm/s", "slip_max_mm_s", 1),
-    ]
     table.add_column("robot")
-    for heading, _, _ in columns:
+    for heading, _, _ in RUN_COLUMNS:
         table.add_column(heading, justify="right")
-    table.add_column("lost,\ntouched")
+    table.add_column("verdict")
+    end_s = float(record.t_s[-1])
     for i, metrics in enumerate(record.metrics()):
         row = metrics._asdict() | {"saturation_fraction": 100 * metrics.saturation_fraction}
         cells = [
-            "–" if row[key] is None else f"{row[key]:.{digits}f}" for _, key, digits in columns
+            "–" if row[key] is None else f"{row[key]:.{digits}f}" for _, key, digits in RUN_COLUMNS
         ]
-        ends = ["lost"] if metrics.lost else []
-        ends += [str(metrics.touched_by)] if metrics.touched else []
-        table.add_row(str(i), *cells, ", ".join(ends) or "ok")
+        table.add_row(str(i), *cells, verdict(metrics, i * scenario.time_gap_s < end_s))
     return table
+
+
+def verdict(metrics: RobotMetrics, set_out: bool) -> str:
+    """How a run ended for one robot, in words; nothing is held by a robot that has not set out."""
+    if metrics.lost or metrics.touched:
+        parts = ["lost"] if metrics.lost else []
+        parts += [f"touched {metrics.touched_by}"] if metrics.touched else []
+        return ", ".join(parts)
+    return "held" if set_out else "not set out"
 
 
 def speed_table(result: dict[str, Any]) -> Table:

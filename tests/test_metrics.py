@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from baselines.policies.reference import ReferencePolicy
 from baselines.runs.run import run_policy
+from baselines.tables import metrics_table
 from tlf_env.task.metrics import (
     RobotMetrics,
     StringMetrics,
@@ -358,6 +359,28 @@ def test_deviation_from_a_reference_that_stands_is_zero():
 def test_the_documentation_defines_every_metric_in_order():
     defined = re.findall(r"^\| `(\w+)` \|", DOCS.read_text(encoding="utf-8"), re.MULTILINE)
     assert defined == [*RobotMetrics._fields, *StringMetrics._fields]
+
+
+class Still:
+    """A policy that does nothing."""
+
+    def predict(self, rows, state=None, episode_start=None, deterministic=True):
+        return np.zeros((len(rows), 2)), state
+
+
+def test_a_start_is_no_loss_on_a_short_run():
+    """In 6 s the leader is still catching up with a reference that began at full speed."""
+    scenario = load_scenario("infinity", horizon_s=6.0)
+    record = run_policy(scenario, ReferencePolicy(), 0)
+    assert np.sqrt(np.mean(record["position_error_mm"][-90:, 0] ** 2)) > 100
+    found = record.metrics()
+    assert not any(robot.lost for robot in found)
+    set_out = [i * scenario.time_gap_s < 6.0 for i in range(3)]
+    cells = list(metrics_table(record).columns[-1].cells)
+    assert cells == ["held" if one else "not set out" for one in set_out]
+    assert cells.count("not set out") == 1
+    standing = run_policy(load_scenario("infinity", horizon_s=20.0, lost_beyond_mm=1e6), Still())
+    assert standing.metrics()[0].lost  # the errors after 10 s count
 
 
 @pytest.mark.parametrize("horizon_s", [0.02, 0.04, 0.1, 1.0, 4.0, 5.0, 6.0, 10.0, 12.0])

@@ -1,6 +1,5 @@
 """What the commands share: ranges of seeds, failed runs, the recorded command, ``python -m baselines``."""
 
-import json
 import subprocess
 import sys
 
@@ -8,7 +7,7 @@ import numpy as np
 import pytest
 
 from baselines import ReferencePolicy
-from baselines.runs.files import write_mat, write_record
+from baselines.runs.files import summary, write_mat, write_record
 from baselines.runs.outcome import failed
 from baselines.runs.provenance import command_line, installed_versions, versions
 from baselines.runs.run import SEEDS_PER_BLOCK, run_policy, run_seeds, seed_blocks
@@ -158,16 +157,15 @@ def run_ahead(world, **fields):
     ],
     ids=["nothing", "wall", "post", "moving", "pushed"],
 )
-def test_a_run_says_what_was_touched(world, by, tmp_path):
+def test_a_run_says_what_was_touched(world, by):
     record = run_ahead(world)
     (robot,) = record.metrics()
     assert (robot.touched, robot.touched_by) == (by is not None, by)
     assert record.contact == failed([robot]) == robot.touched
-    write_record(record, tmp_path)
-    summary = json.loads((tmp_path / "summary.json").read_text(encoding="utf-8"))
-    assert summary["robots"]["robot_0"]["touched_by"] == by
+    assert summary(record)["robots"]["robot_0"]["touched_by"] == by
     (cell,) = metrics_table(record).columns[-1].cells
-    assert cell == (", ".join(["lost"] * robot.lost + [by] * robot.touched) or "ok")
+    parts = ["lost"] * robot.lost + [f"touched {by}"] * robot.touched
+    assert cell == (", ".join(parts) or "held")
 
 
 @pytest.mark.filterwarnings("ignore::tlf_env.task.warn.ReferenceWarning")
@@ -220,4 +218,9 @@ def test_without_things_that_move_a_record_is_as_before(tmp_path):
     assert record.objects is None
     write_record(record, tmp_path)
     with np.load(tmp_path / "trajectory.npz") as arrays:
-        assert set(arrays.files) == {"t_s", "leader_reference_mm", *record.columns}
+        assert set(arrays.files) == {
+            "t_s",
+            "leader_reference_mm",
+            *record.columns,
+            *record.signals,
+        }

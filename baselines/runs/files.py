@@ -8,13 +8,15 @@ from typing import Any
 
 import numpy as np
 
+from baselines.runs.folders import IDENTITY, SUMMARY, WRITTEN, Identity
 from baselines.runs.provenance import versions
-from baselines.runs.run import RECORDED, Record
+from baselines.runs.run import Record
+from baselines.runs.signals import OBSERVATION
 from tlf_env.common.files import atomic
 
 
 def summary(record: Record) -> dict[str, Any]:
-    """What ``summary.json`` holds."""
+    """What ``summary.json`` holds, besides its run's identity and files."""
     return {
         "scenario": record.scenario.model_dump(mode="json"),
         "seed": record.seed,
@@ -22,6 +24,8 @@ def summary(record: Record) -> dict[str, Any]:
         "policy": record.policy,
         "privileged": record.scenario.privileged,
         "settle_s": record.scenario.settle_s,
+        "simulated_s": float(record.t_s[-1]),
+        "interrupted": record.interrupted,
         "versions": versions(),
         "string": record.string()._asdict(),
         "robots": {f"robot_{i}": metrics._asdict() for i, metrics in enumerate(record.metrics())},
@@ -35,30 +39,80 @@ def arrays(record: Record) -> dict[str, np.ndarray]:
     to push or moving obstacles, also ``objects`` (time, object, 3): their x and y (mm) and angle (rad), the
     pushables first, each kind in the order of the scenario.
     """
-    out = {"t_s": record.t_s, "leader_reference_mm": record.leader, **record.columns}
+    out = {
+        "t_s": record.t_s,
+        "leader_reference_mm": record.leader,
+        **record.columns,
+        **record.signals,
+    }
     return out if record.objects is None else {**out, "objects": record.objects}
 
 
-def write_record(record: Record, folder: Path) -> list[Path]:
-    """Write ``summary.json``, ``trajectory.npz`` and ``trajectory.csv``, each atomically.
+def table(record: Record, *, observations: bool) -> dict[str, np.ndarray]:
+    """The columns of a run as one table with a row for each time and robot, each ``(time · robot,)``.
 
-    The table has a row for each time and robot, and the columns of a record.
+    Parameters
+    ----------
+    observations
+        Whether the entries of the observations are among the columns.
     """
-    paths = [folder / name for name in ("summary.json", "trajectory.npz", "trajectory.csv")]
-    with atomic(paths[0], encoding="utf-8") as file:
-        json.dump(summary(record), file, indent=2, allow_nan=False)
-        file.write("\n")
-    with atomic(paths[1], "wb") as file:
+    columns = {
+        name: values.ravel()
+        for name, values in (record.columns | dict(record.signals)).items()
+        if observations or not name.startswith(OBSERVATION)
+    }
+    return {
+        "t_s": np.repeat(record.t_s, record.robots),
+        "robot": np.tile(np.arange(record.robots), len(record.t_s)),
+        **columns,
+    }
+
+
+def write_record(record: Record, folder: Path) -> list[Path]:
+    """Write ``trajectory.npz`` and ``trajectory.csv``, each atomically.
+
+    The CSV file has a row for each time and robot, and all columns but the observations.
+    """
+    paths = [folder / name for name in ("trajectory.npz", "trajectory.csv")]
+    with atomic(paths[0], "wb") as file:
         columns: dict[str, Any] = arrays(record)
         np.savez_compressed(file, **columns)
-    table = np.stack([record[name] for name in RECORDED], axis=-1).reshape(-1, len(RECORDED))
-    times = np.repeat(record.t_s, record.robots)
-    numbers = np.tile(np.arange(record.robots), len(record.t_s))
-    with atomic(paths[2], encoding="utf-8") as file:
-        file.write(",".join(("t_s", "robot", *RECORDED)) + "\n")
-        rows = np.column_stack([times, numbers, table])
-        np.savetxt(file, rows, fmt=["%.6g", "%d", *["%.9g"] * len(RECORDED)], delimiter=",")
+    rows = table(record, observations=False)
+    with atomic(paths[1], encoding="utf-8") as file:
+        file.write(",".join(rows) + "\n")
+        formats = ["%.6g", "%d", *["%.9g"] * (len(rows) - 2)]
+        np.savetxt(file, np.column_stack(list(rows.values())), fmt=formats, delimiter=",")
     return paths
+
+
+def write_summary(record: Record, folder: Path, identity: Identity, written: list[Path]) -> Path:
+    """Write ``summary.json``, after all other files: with it the run's folder is complete."""
+    path = folder / SUMMARY
+    names = sorted({*(one.name for one in written), SUMMARY})
+    with atomic(path, encoding="utf-8") as file:
+        data = {**summary(record), IDENTITY: list(identity), WRITTEN: names}
+        json.dump(data, file, indent=2, allow_nan=False)
+        file.write("\n")
+    return path
+
+
+def write_parquet(record: Record, folder: Path) -> Path:
+    """Write ``trajectory.parquet``: a row for each time and robot, all columns.
+
+    Raises
+    ------
+    ValueError
+        without pyarrow.
+    """
+    try:
+        import pyarrow as pa
+        import pyarrow.parquet as pq
+    except ModuleNotFoundError as error:
+        raise ValueError(f"--parquet needs {error.name} (pip install 'tlf-env[data]')") from error
+    path = folder / "trajectory.parquet"
+    with atomic(path, "wb") as file:
+        pq.write_table(pa.table(table(record, observations=True)), file)
+    return path
 
 
 def write_mat(record: Record, folder: Path) -> Path:
@@ -67,5 +121,6 @@ def write_mat(record: Record, folder: Path) -> Path:
 
     path = folder / "trajectory.mat"
     with atomic(path, "wb") as file:
-        savemat(file, arrays(record))
+        # A name in MATLAB has no dot.
+        savemat(file, {name.replace(".", "_"): one for name, one in arrays(record).items()})
     return path

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
 
+from baselines.runs.signals import SignalTape
 from tlf_env.engine import readout
 from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.batch import BatchPlant
@@ -84,9 +85,12 @@ class Record:
     options: Mapping[str, Any] | None = None  # of the reset
     # (time, object, 3): x and y (mm) and angle (rad) of the world's pushables, then of its moving obstacles
     objects: np.ndarray | None = None  # None if the world has neither
+    # Further columns, each (time, robot), of :mod:`baselines.runs.signals`; of single runs only.
+    signals: Mapping[str, np.ndarray] = field(default_factory=dict)
+    interrupted: bool = False  # before the horizon
 
     def __getitem__(self, column: str) -> np.ndarray:
-        return self.columns[column]
+        return self.columns[column] if column in self.columns else self.signals[column]
 
     @property
     def robots(self) -> int:
@@ -126,6 +130,8 @@ def run_policy(
 ) -> Record:
     """Run a policy over the whole horizon, without early ends (``end_on=()``), and record everything.
 
+    A ``KeyboardInterrupt`` (Ctrl-C) ends the run; the record has what was simulated, and is marked.
+
     Parameters
     ----------
     parts
@@ -144,21 +150,30 @@ def run_policy(
     formation = Formation(scenario.model_copy(update={"end_on": ()}), parts)
     formation.reset(checked_seed(seed), start=start_options(options, scenario.robot_count))
     a, steps = formation.arrays, scenario.horizon_steps
-    tape = _Tape(a, steps)
+    tape, signals = _Tape(a, steps), SignalTape(a, scenario)
     driver = _Driver(policy, scenario, a, name)
     objects = [formation.plant.object_poses(0)]
-    for k in range(1, steps + 1):
-        a.actions[:] = driver.act()
-        formation.step()
-        tape.note(k, scenario.control_period_s)
-        objects.append(formation.plant.object_poses(k))
-        if progress is not None:
-            progress(k, steps)
+    done = 0
+    try:
+        for k in range(1, steps + 1):
+            a.actions[:] = driver.act()
+            formation.step()
+            objects.append(formation.plant.object_poses(k))
+            signals.note(k)
+            tape.note(k, scenario.control_period_s)
+            done = k
+            if progress is not None:
+                progress(k, steps)
+    except KeyboardInterrupt:
+        if not done:
+            raise
     plain = {name: np.asarray(value).tolist() for name, value in (options or {}).items()} or None
     return replace(
-        tape.record(0, scenario, seed, name),
+        tape.record(0, scenario, seed, name, done),
         options=plain,
-        objects=np.stack(objects) if objects[0].size else None,
+        objects=np.stack(objects[: done + 1]) if objects[0].size else None,
+        signals=signals.columns(done),
+        interrupted=done < steps,
     )
 
 
@@ -265,18 +280,21 @@ class _Tape:
         ended = np.isfinite(self._lost_at_s) | np.isfinite(self._touched_at_s)
         return int(ended.any(axis=1).sum())
 
-    def record(self, lane: int, scenario: Scenario, seed: int, policy: str) -> Record:
-        """The record of a lane."""
+    def record(
+        self, lane: int, scenario: Scenario, seed: int, policy: str, steps: int | None = None
+    ) -> Record:
+        """The record of a lane, of all its steps or of the first ones."""
         period_s = scenario.control_period_s
-        columns = {name: self._infos[lane, :, :, i] for i, name in enumerate(FROM_INFO)}
-        columns |= {name: self._wheels[lane, :, i] for i, name in enumerate(FROM_WHEELS)}
+        rows = (self._steps if steps is None else steps) + 1
+        columns = {name: self._infos[lane, :rows, :, i] for i, name in enumerate(FROM_INFO)}
+        columns |= {name: self._wheels[lane, :rows, i] for i, name in enumerate(FROM_WHEELS)}
         return Record(
             scenario=scenario,
             seed=seed,
             policy=policy,
-            t_s=np.arange(self._steps + 1) * period_s,
+            t_s=np.arange(rows) * period_s,
             columns=_with_functionals(columns, period_s),
-            leader=self._arrays.tables[0, : self._steps + 1, :2].copy(),
+            leader=self._arrays.tables[0, :rows, :2].copy(),
             lost_at_s=self._lost_at_s[lane],
             touched_at_s=self._touched_at_s[lane],
             touched_by=self._touched_by[lane],

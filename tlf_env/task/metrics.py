@@ -14,6 +14,7 @@ ERROR_CAP_MM = 500.0
 FORMATION_SETTLE_S = 5.0
 LOST_RMS_MM = 100.0
 LOST_TAIL_FRACTION = 0.3
+START_S = 10.0  # so long a robot that sets out may be far from its reference
 SCORE_UNIT_MM = 10.0
 NEAR_MM = 10.0
 SETTLED_MM = 20.0  # settling time: the position error stays below this
@@ -70,10 +71,9 @@ def robot_metrics(
     ``lost_at_s`` and ``touched_at_s`` ``(robot,)`` are the times at which a robot's error first exceeded
     ``lost_beyond_mm`` and at which it first touched another robot, a wall or an obstacle, infinity if never;
     ``touched_by`` is what it touched, a :class:`~tlf_env.TouchedBy`. A robot also counts as lost if its RMS
-    error over the last 30 % of the run is above 100 mm.
+    error over the last 30 % of the run is above 100 mm, without the first 10 s after it sets out.
     """
     settled = t_s >= scenario.settle_s
-    tail = t_s >= (1 - LOST_TAIL_FRACTION) * scenario.horizon_s
     nearest = nearest_mm(columns)
     out = []
     for i in range(len(lost_at_s)):
@@ -82,7 +82,10 @@ def robot_metrics(
         in_formation = t_s >= i * scenario.time_gap_s + FORMATION_SETTLE_S
         formation = columns["formation_error_mm"][:, i]
         gapped = settled & (t_s >= scenario.time_gap_s)
-        tail_rms = rms(error[tail])
+        tail_s = max(
+            (1 - LOST_TAIL_FRACTION) * scenario.horizon_s, i * scenario.time_gap_s + START_S
+        )
+        tail_rms = rms(error[t_s >= tail_s])
         end_s = min(float(lost_at_s[i]), float(touched_at_s[i]))
         out.append(
             RobotMetrics(

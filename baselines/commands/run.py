@@ -1,0 +1,150 @@
+"""``tlf run``: one run, from its scenario to its folder."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import typer
+
+from baselines.console import (
+    notes,
+    progress_bar,
+    screen,
+    warn_of_compiling,
+    warn_of_missing,
+    warn_of_scenarios,
+    writable_folder,
+)
+from baselines.policies.registry import (
+    FittedPolicy,
+    describe_overrides,
+    fit_policy,
+    policy_hash,
+)
+from baselines.runs.files import (
+    summary,
+    write_mat,
+    write_parquet,
+    write_record,
+    write_summary,
+)
+from baselines.runs.folders import (
+    Identity,
+    folder_name,
+    identity_of,
+    is_preset,
+    make_room,
+    write_index,
+)
+from baselines.runs.run import Record, run_policy
+from baselines.tables import metrics_table
+from tlf_env.numerics.philox import checked_seed
+from tlf_env.task.scenario import Scenario, load_scenario, scenario_notes
+from tlf_env.task.start import start_options
+
+RESULTS = Path("results")
+
+
+class Wanted(NamedTuple):
+    """What a run writes and prints."""
+
+    out: Path | None = None  # None: a folder of its own below `results`
+    overwrite: bool = False
+    figures: bool = True
+    mat: bool = False
+    parquet: bool = False
+    as_json: bool = False
+
+
+def run_command(
+    chosen: Scenario,
+    name: str,
+    seed: int,
+    options: Mapping[str, Any],
+    wanted: Wanted,
+    *,
+    trust: bool,
+) -> bool:
+    """Run a policy in a scenario, write its folder and print its table; whether it was not interrupted.
+
+    Raises
+    ------
+    ValueError
+        for whatever does not fit, before the run.
+    """
+    checked_seed(seed)
+    start_options(options, chosen.robot_count)
+    fitted = fit_policy(name, chosen, trust=trust)
+    if fitted.overrides:
+        fields = ", ".join(describe_overrides(fitted.overrides))
+        notes.print(f"tlf: note: {name} asks for {fields}", soft_wrap=True)
+    scenario = fitted.scenario
+    warn_of_scenarios([(scenario.name, scenario)])
+    for line in scenario_notes(scenario):
+        notes.print(f"tlf: note: {line}", soft_wrap=True)
+    identity = _identity(name, fitted, seed, options)
+    folder = wanted.out
+    if folder is None:
+        folder = RESULTS / folder_name(scenario, identity, _usual(chosen, name, seed, trust))
+    writable_folder(folder)
+    make_room(folder, identity, wanted.overwrite)
+    warn_of_compiling()
+    with progress_bar(f"{scenario.name}, {name}") as update:
+        record = run_policy(
+            scenario, fitted.policy, seed, name=name, options=options, progress=update
+        )
+    written = write_run(record, folder, identity, wanted)
+    if wanted.out is None:
+        write_index(RESULTS)
+    if wanted.as_json:
+        typer.echo(json.dumps(summary(record), indent=2, allow_nan=False))
+    else:
+        screen.print(metrics_table(record))
+        screen.print(f"In {folder}: {', '.join(path.name for path in written)}", soft_wrap=True)
+    if record.interrupted:
+        notes.print(
+            f"tlf: interrupted after {record.t_s[-1]:.6g} s of {scenario.horizon_s:g} s; what was simulated is "
+            "in the folder. The same command runs it from the start.",
+            soft_wrap=True,
+        )
+    return not record.interrupted
+
+
+def write_run(record: Record, folder: Path, identity: Identity, wanted: Wanted) -> list[Path]:
+    """Write all files of a run, the summary last."""
+    written = write_record(record, folder)
+    if wanted.mat:
+        written.append(write_mat(record, folder))
+    if wanted.parquet:
+        written.append(write_parquet(record, folder))
+    if wanted.figures:
+        written += draw(record, folder)
+    return [write_summary(record, folder, identity, written), *written]
+
+
+def draw(record: Record, folder: Path) -> list[Path]:
+    """The figures of a run; none, and a note, if matplotlib is missing."""
+    try:
+        from baselines.runs.figures import write_figures
+    except ModuleNotFoundError as error:
+        warn_of_missing(error)
+        return []
+    return write_figures(record, folder)
+
+
+def _identity(
+    name: str, fitted: FittedPolicy, seed: int, options: Mapping[str, Any] | None
+) -> Identity:
+    digits = policy_hash(name, fitted.policy)
+    return identity_of(fitted.scenario, name, digits, seed, options)
+
+
+def _usual(chosen: Scenario, name: str, seed: int, trust: bool) -> Identity | None:
+    """The identity of the run that the names alone describe; None if they do not."""
+    if not is_preset(chosen) or Path(name).suffix:
+        return None
+    usual = load_scenario(chosen.name, disturbance=chosen.disturbance.name)
+    return _identity(name, fit_policy(name, usual, trust=trust), seed, {})

@@ -1,0 +1,192 @@
+"""Folders of runs: one for each, never half of an old run beside a new one, and a page that lists them."""
+
+from __future__ import annotations
+
+import hashlib
+import html
+import json
+import re
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tlf_env.common.files import atomic, read_json
+from tlf_env.common.presets import preset_names
+from tlf_env.task.neutral import scenario_hash
+from tlf_env.task.scenario import Scenario
+
+SUMMARY = "summary.json"
+INDEX = "index.html"
+WRITTEN = "files"  # entry of a summary: the files of its run
+IDENTITY = "identity"  # entry of a summary: what the run depends on
+NOT_IN_FOLDERS = re.compile(r"[^\w.+-]+")
+LONGEST = 60  # characters of a policy's name in a folder's name
+HASH = 6  # hexadecimal digits in a folder's name
+
+
+class Identity(NamedTuple):
+    """What a run depends on, beside the code."""
+
+    scenario: str  # its hash
+    policy: str
+    policy_hash: str | None  # of its files
+    seed: int
+    options: str  # of the reset, in JSON
+
+    def digits(self) -> str:
+        """Some hexadecimal digits over all of it."""
+        return hashlib.sha256(json.dumps(self).encode()).hexdigest()[:HASH]
+
+
+def identity_of(
+    scenario: Scenario,
+    policy: str,
+    policy_hash: str | None,
+    seed: int,
+    options: Mapping[str, Any] | None,
+) -> Identity:
+    """The identity of a run."""
+    text = json.dumps(dict(options or {}), sort_keys=True)
+    return Identity(scenario_hash(scenario), policy, policy_hash, seed, text)
+
+
+def folder_name(scenario: Scenario, identity: Identity, usual: Identity | None) -> str:
+    """``TASK-POLICY-DISTURBANCE-SEED``, and some digits where anything else differs from the usual.
+
+    Parameters
+    ----------
+    usual
+        The identity of the run with the preset's own values; None: there is no such preset.
+    """
+    policy = NOT_IN_FOLDERS.sub("_", identity.policy.removeprefix("reference:")).strip("_.")
+    parts = [scenario.name, policy[-LONGEST:], scenario.disturbance.name, str(identity.seed)]
+    if usual is None or identity != usual:
+        parts.append(identity.digits())
+    return NOT_IN_FOLDERS.sub("_", "-".join(parts))
+
+
+def is_preset(scenario: Scenario) -> bool:
+    """Whether a preset has the scenario's name, and another its disturbance's."""
+    return scenario.name in preset_names() and scenario.disturbance.name in preset_names(
+        "disturbance"
+    )
+
+
+def make_room(folder: Path, identity: Identity, overwrite: bool) -> None:
+    """Remove the files of an earlier run from a folder: of the same run, or of any with ``overwrite``.
+
+    Other files stay.
+
+    Raises
+    ------
+    ValueError
+        if the folder holds another run, naming what differs.
+    """
+    path = folder / SUMMARY
+    if not path.exists():
+        return
+    try:
+        before = dict(read_json(path))
+    except (ValueError, TypeError):
+        before = {}
+    held = before.get(IDENTITY)
+    if not overwrite and held != list(identity):
+        raise ValueError(
+            f"{folder} holds another run ({_difference(held, identity)}); --overwrite replaces it, --out "
+            "names another folder"
+        )
+    for name in before.get(WRITTEN, []):
+        if isinstance(name, str) and Path(name).name == name:
+            (folder / name).unlink(missing_ok=True)
+    path.unlink(missing_ok=True)
+
+
+def _difference(held: Any, identity: Identity) -> str:
+    """What differs between the identity in a folder and another."""
+    if not isinstance(held, list) or len(held) != len(identity):
+        return "of an older version"
+    names = [
+        name.replace("_", " ")
+        for name, old, new in zip(Identity._fields, held, identity, strict=True)
+        if old != new
+    ]
+    old = Identity(*held)
+    return f"{old.policy}, seed {old.seed}; different: {', '.join(names)}"
+
+
+# --- the page that lists runs
+
+HEADINGS = ("run", "task", "policy", "disturbance", "seed", "worst position RMS, mm", "verdict")
+PAGE = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><title>Runs</title>
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<style>
+:root {{ color-scheme: light dark; }}
+body {{ font-family: system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem; }}
+table {{ border-collapse: collapse; width: 100%; }}
+th, td {{ text-align: left; padding: 0.35rem 0.7rem; border-bottom: 1px solid #8884; }}
+td.number {{ text-align: right; font-variant-numeric: tabular-nums; }}
+img {{ height: 5rem; }}
+</style></head><body>
+<h1>Runs in this folder</h1>
+<p>Made by <code>tlf run</code>; the latest is first. Errors: the largest root mean square among the robots.</p>
+<table><thead><tr>{headings}<th>overview</th></tr></thead><tbody>
+{rows}
+</tbody></table></body></html>
+"""
+
+
+def write_index(parent: Path) -> Path | None:
+    """Write a page with a row for each run in the folders of ``parent``; None if there is no run."""
+    summaries = sorted(parent.glob(f"*/{SUMMARY}"), key=lambda path: -path.stat().st_mtime)
+    rows = [row for path in summaries if (row := _row(path)) is not None]
+    if not rows:
+        return None
+    page = parent / INDEX
+    headings = "".join(f"<th>{heading}</th>" for heading in HEADINGS)
+    with atomic(page, encoding="utf-8") as file:
+        file.write(PAGE.format(headings=headings, rows="\n".join(rows)))
+    return page
+
+
+def _row(path: Path) -> str | None:
+    """A row of the page; None for a summary that cannot be read."""
+    try:
+        data = read_json(path)
+        robots = list(data["robots"].values())
+        errors = [robot["position_rmse_mm"] for robot in robots]
+        scenario = data["scenario"]
+        cells = [
+            scenario["name"],
+            data["policy"],
+            scenario["disturbance"]["name"],
+            str(data["seed"]),
+            "–" if None in errors else f"{max(errors):.2f}",
+            verdict(data.get("interrupted", False), robots),
+        ]
+    except (ValueError, TypeError, KeyError, AttributeError):
+        return None
+    name = html.escape(path.parent.name)
+    picture = path.parent / "overview.png"
+    image = f'<img src="{name}/{picture.name}" alt="overview">' if picture.exists() else ""
+    texts = "".join(
+        f'<td class="number">{html.escape(cell)}</td>'
+        if number in (3, 4)
+        else f"<td>{html.escape(cell)}</td>"
+        for number, cell in enumerate(cells)
+    )
+    return (
+        f'<tr><td><a href="{name}/">{name}</a></td>{texts}'
+        f'<td><a href="{name}/{picture.name}">{image}</a></td></tr>'
+    )
+
+
+def verdict(interrupted: bool, robots: Iterable[Mapping[str, Any]]) -> str:
+    """How a run ended, in words."""
+    robots = list(robots)
+    lost = sum(bool(robot["lost"]) for robot in robots)
+    touched = sum(bool(robot["touched"]) for robot in robots)
+    parts = [f"{lost} lost"] if lost else []
+    parts += [f"{touched} touched"] if touched else []
+    parts += ["interrupted"] if interrupted else []
+    return ", ".join(parts) or "held"
