@@ -12,7 +12,6 @@ from baselines.runs.run import Record
 from baselines.training.curve import kept_evaluation
 from tlf_env.task.metrics import RobotMetrics
 
-
 RUN_COLUMNS: tuple[tuple[str, str, int], ...] = (
     ("position RMS\nmm", "position_rmse_mm", 2),
     ("largest\nmm", "position_max_mm", 1),
@@ -30,8 +29,9 @@ def metrics_table(record: Record) -> Table:
     table = Table(
         title=f"{scenario.name}, {record.policy}, disturbance {scenario.disturbance.name}, "
         f"seed {record.seed}",
-        caption=f"Errors from {scenario.settle_s:g} s on (formation: from 5 s after the robot sets out). Position: "
-        "to the robot's own reference. Formation: to the leader's path, one time gap later for each robot.",
+        caption=f"Errors from {scenario.settle_s:g} s on (formation: from 5 s after the robot sets out). "
+        "Position: to the robot's own reference. Formation: to the leader's path, one time gap later for each "
+        "robot.",
         box=SIMPLE_HEAD,
         collapse_padding=True,
         pad_edge=False,
