@@ -19,8 +19,8 @@ help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
 	while IFS='|' read -r target text; do printf '%-20s %s\n' "  $$target" "$$text"; done
 
-run: compile ## Run the reference policy on the preset infinity; results in results/infinity
-	$(BIN)/tlf run infinity --out results/infinity
+run: compile ## Compare three controllers, with and without slip: a table, and a picture in results/demo
+	$(BIN)/tlf demo
 
 compile: $(VENV)/.stamp-run ## Compile the step drivers, if that was not done before
 	$(BIN)/tlf compile $(COMPILE)

@@ -29,6 +29,7 @@ from baselines.console import (
     whole_numbers,
     writable_folder,
 )
+from tlf_env.common.errors import install_command
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
@@ -68,6 +69,22 @@ def everywhere(
     ] = False,
 ) -> None:
     """Time-gap leader-follower formations of wheeled robots that slip."""
+
+
+@app.command()
+def demo(
+    seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
+    out: Annotated[Path, typer.Option(help="Folder of the picture and the data.")] = Path(
+        "results/demo"
+    ),
+    figures: Annotated[bool, typer.Option(help="Draw the picture.")] = True,
+) -> None:
+    """Compare the paper's loop, the default and a learned policy, with and without slip: a first look."""
+    from baselines.commands.demo import demo_command
+    from tlf_env.numerics.philox import checked_seed
+
+    warn_of_compiling()
+    demo_command(checked_seed(seed), out, figures=figures)
 
 
 @app.command("list")
@@ -626,7 +643,7 @@ def train(
     try:
         from baselines.training.train_seeds import train_seeds
     except ModuleNotFoundError as error:
-        raise ValueError(f"training needs {error.name} (pip install 'tlf-env[train]')") from error
+        raise ValueError(f"training needs {error.name} ({install_command('train')})") from error
     name = Path(config).stem
     folder = writable_folder(out or Path("results/train") / name)
     warn_of_scenarios(loaded.named_scenarios())

@@ -15,6 +15,8 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
+from tlf_env.common.errors import install_command
+
 if TYPE_CHECKING:
     from tlf_env.task.scenario import Scenario
 
@@ -87,7 +89,8 @@ def warn_of_compiling() -> None:
 
 def warn_of_missing(error: ModuleNotFoundError) -> None:
     """Say that figures are left out because a package is missing."""
-    notes.print(f"No figures: {error.name} is missing (pip install 'tlf-env[figures]').")
+    hint = f"No figures: {error.name} is missing ({install_command('figures')})."
+    notes.print(hint, soft_wrap=True)
 
 
 def whole_numbers(name: str, text: str) -> list[int]:

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from baselines import cli, console
+from tlf_env.common.errors import install_command
 
 ROOT = Path(__file__).parent.parent
 EXTRAS = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"][
@@ -92,6 +93,14 @@ def test_the_extra_of_every_hint_is_printed(extra, capsys):
     with pytest.raises(SystemExit):
         cli.fail(hint, 2)
     assert hint in capsys.readouterr().err
+
+
+def test_the_command_of_a_hint_is_of_this_installation(monkeypatch, tmp_path):
+    """Of its Python, as another pip would install into another place."""
+    monkeypatch.setenv("PATH", str(Path(sys.executable).parent))
+    assert install_command("data") == "python -m pip install 'tlf-env[data]'"
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert install_command("data") == f"{sys.executable} -m pip install 'tlf-env[data]'"
 
 
 def test_a_missing_matplotlib_names_its_extra(capsys):

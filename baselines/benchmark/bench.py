@@ -20,6 +20,7 @@ from baselines.policies.registry import FittedPolicy, fit_policy
 from baselines.runs.jobs import spread
 from baselines.runs.provenance import physics_digest
 from baselines.runs.run import Record, run_policy, run_seeds, seed_blocks
+from tlf_env.common.errors import install_command
 from tlf_env.task.neutral import scenario_hash
 from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -127,7 +128,7 @@ def run_bench(
     if processes < 1:
         raise ValueError(f"processes {processes} must be at least 1")
     if find_spec("arch") is None:
-        raise ValueError("the tables need arch (pip install 'tlf-env[bench]')")
+        raise ValueError(f"the tables need arch ({install_command('bench')})")
     results = Results(folder, plan)
     begin()
     todo = results.missing()

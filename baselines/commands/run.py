@@ -85,7 +85,7 @@ def run_command(
     warn_of_scenarios([(scenario.name, scenario)])
     for line in scenario_notes(scenario):
         notes.print(f"tlf: note: {line}", soft_wrap=True)
-    identity = _identity(name, fitted, seed, options)
+    identity = identity_for(name, fitted, seed, options)
     folder = wanted.out
     if folder is None:
         folder = RESULTS / folder_name(scenario, identity, _usual(chosen, name, seed, trust))
@@ -135,9 +135,10 @@ def draw(record: Record, folder: Path) -> list[Path]:
     return write_figures(record, folder)
 
 
-def _identity(
+def identity_for(
     name: str, fitted: FittedPolicy, seed: int, options: Mapping[str, Any] | None
 ) -> Identity:
+    """The identity of a run with a policy of this name."""
     digits = policy_hash(name, fitted.policy)
     return identity_of(fitted.scenario, name, digits, seed, options)
 
@@ -147,4 +148,4 @@ def _usual(chosen: Scenario, name: str, seed: int, trust: bool) -> Identity | No
     if not is_preset(chosen) or Path(name).suffix:
         return None
     usual = load_scenario(chosen.name, disturbance=chosen.disturbance.name)
-    return _identity(name, fit_policy(name, usual, trust=trust), seed, {})
+    return identity_for(name, fit_policy(name, usual, trust=trust), seed, {})

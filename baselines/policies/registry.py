@@ -25,7 +25,7 @@ from baselines.policies.systems import (
     system_controllers,
 )
 from tlf_env.common.digest import code_of
-from tlf_env.common.errors import suggestion
+from tlf_env.common.errors import install_command, suggestion
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 from tlf_env.onboard.parts import Policy, load_part, make_part
 from tlf_env.task.actions import ACTION_SIZE
@@ -295,9 +295,7 @@ def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
     try:
         from stable_baselines3.common.save_util import load_from_zip_file
     except ModuleNotFoundError as error:
-        raise ValueError(
-            f"{path} needs stable-baselines3 (pip install 'tlf-env[train]')"
-        ) from error
+        raise ValueError(f"{path} needs stable-baselines3 ({install_command('train')})") from error
     import stable_baselines3
 
     data, _, _ = load_from_zip_file(path, device="cpu")

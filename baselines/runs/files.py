@@ -12,6 +12,7 @@ from baselines.runs.folders import IDENTITY, SUMMARY, WRITTEN, Identity
 from baselines.runs.provenance import versions
 from baselines.runs.run import Record
 from baselines.runs.signals import OBSERVATION
+from tlf_env.common.errors import install_command
 from tlf_env.common.files import atomic
 
 
@@ -108,7 +109,7 @@ def write_parquet(record: Record, folder: Path) -> Path:
         import pyarrow as pa
         import pyarrow.parquet as pq
     except ModuleNotFoundError as error:
-        raise ValueError(f"--parquet needs {error.name} (pip install 'tlf-env[data]')") from error
+        raise ValueError(f"--parquet needs {error.name} ({install_command('data')})") from error
     path = folder / "trajectory.parquet"
     with atomic(path, "wb") as file:
         pq.write_table(pa.table(table(record, observations=True)), file)

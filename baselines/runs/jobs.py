@@ -15,6 +15,7 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, TypeVar
 
+from tlf_env.common.errors import install_command
 from tlf_env.common.files import atomic, read_json
 
 POLLED_EVERY_S = 0.5
@@ -164,7 +165,7 @@ def _on_ray(
     try:
         import ray
     except ModuleNotFoundError as error:
-        raise ValueError("--ray needs ray (pip install 'tlf-env[ray]')") from error
+        raise ValueError(f"--ray needs ray ({install_command('ray')})") from error
     try:
         ray.init(address=address, log_to_driver=False)
     except (ConnectionError, ValueError, RuntimeError) as error:

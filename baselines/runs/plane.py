@@ -130,7 +130,7 @@ def draw_plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
         axes.plot(*path[:1].T, **style, zorder=2.2)  # the start once more, above all paths
     for k in reversed(rows):
         for i in range(n):
-            _draw_body(record, axes, k, i, strength=1.0 if k == rows[0] else FADED)
+            draw_body(record, axes, k, i, strength=1.0 if k == rows[0] else FADED)
     for k in rows:
         _time_label(record, axes, k, rows)
     axes.set(xlim=low_high[:, 0], ylim=low_high[:, 1], aspect="equal")
@@ -138,7 +138,8 @@ def draw_plane(record: Record, axes: Axes, rows: Sequence[int]) -> None:
     tidy(axes)
 
 
-def _draw_body(record: Record, axes: Axes, row: int, number: int, strength: float) -> None:
+def draw_body(record: Record, axes: Axes, row: int, number: int, strength: float) -> None:
+    """A robot at a row, to scale, paler with less strength."""
     robot = record.scenario.robot_models[number]
     line = 1 - strength * (1 - np.array(to_rgb(robot_colour(record, number))))
     turned = _axes_of(record["theta_rad"][row, number])

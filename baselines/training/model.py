@@ -12,6 +12,7 @@ from stable_baselines3 import PPO, SAC
 
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import TrainConfig
+from tlf_env.common.errors import install_command
 from tlf_env.task.warn import without_warnings
 
 OFF_POLICY_STEPS = 64
@@ -86,7 +87,7 @@ def algorithm(config: TrainConfig) -> tuple[Callable[..., Any], str]:
     try:
         from sb3_contrib import RecurrentPPO
     except ModuleNotFoundError as error:
-        raise ValueError("RecurrentPPO needs sb3-contrib (pip install 'tlf-env[train]')") from error
+        raise ValueError(f"RecurrentPPO needs sb3-contrib ({install_command('train')})") from error
     return RecurrentPPO, "MlpLstmPolicy"
 
 

@@ -14,6 +14,7 @@ from baselines.runs.jobs import claim
 from baselines.runs.provenance import git_revision, simulation_digest, versions
 from baselines.tuning.config import TuneConfig
 from baselines.tuning.trial import Outcome, TrialJob
+from tlf_env.common.errors import install_command
 from tlf_env.task.neutral import scenario_hash
 
 SEARCH_FILE, STUDY_FILE = "search.json", "study.db"
@@ -176,6 +177,6 @@ def optuna_package() -> Any:
     try:
         import optuna
     except ModuleNotFoundError as error:
-        raise ValueError("the search needs optuna (pip install 'tlf-env[tune]')") from error
+        raise ValueError(f"the search needs optuna ({install_command('tune')})") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
     return optuna

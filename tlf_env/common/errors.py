@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import difflib
 import re
+import shutil
+import sys
 import types
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 from typing import (
     Annotated,
     Any,
@@ -80,6 +83,17 @@ def nearest(name: object, allowed: Iterable[str], others: Mapping[str, str] | No
     if 0 < len(names) <= FEW_NAMES:
         return f"; allowed: {', '.join(names)}"
     return ""
+
+
+def install_command(extra: str) -> str:
+    """The command that adds an extra to the installation that is running.
+
+    pip knows an installed package: it needs an index only for the packages that the extra names.
+    """
+    found = shutil.which("python")
+    active = found is not None and Path(found).parent == Path(sys.executable).parent
+    python = "python" if active else path_text(sys.executable)
+    return f"{python} -m pip install 'tlf-env[{extra}]'"
 
 
 class _Found(NamedTuple):

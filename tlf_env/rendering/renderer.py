@@ -12,6 +12,7 @@ from typing import Any
 
 import numpy as np
 
+from tlf_env.common.errors import install_command
 from tlf_env.physics.shapes import Kind, PlacedShape
 from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.rendering.drawing import BLOCK, FLOOR, INK, Place, Shapes, View, clipped, mixed
@@ -649,6 +650,6 @@ def _pygame() -> Any:
     try:
         import pygame
     except ImportError as error:
-        raise ImportError("rendering needs pygame: pip install 'tlf-env[view]'") from error
+        raise ImportError(f"rendering needs pygame: {install_command('view')}") from error
     pygame.font.init()
     return pygame

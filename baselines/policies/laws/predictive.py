@@ -9,6 +9,7 @@ import numpy as np
 from pydantic import Field
 
 from baselines.policies.laws.law import UNBOUNDED, ErrorBounds, LawFile, Remembering
+from tlf_env.common.errors import install_command
 from tlf_env.common.models import NonNegative, Positive, Whole
 from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.supervisor import Neighbour
@@ -230,7 +231,7 @@ def casadi_package() -> Any:
     try:
         import casadi
     except ModuleNotFoundError as error:
-        raise ValueError("nmpc needs casadi (pip install 'tlf-env[mpc]')") from error
+        raise ValueError(f"nmpc needs casadi ({install_command('mpc')})") from error
     return casadi
 
 
