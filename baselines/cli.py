@@ -253,6 +253,57 @@ def run(
         raise SystemExit(INTERRUPTED)
 
 
+@app.command("path")
+def path_(
+    log: Annotated[
+        Path,
+        typer.Argument(
+            help="Log of positions over time: CSV with any delimiter and decimal sign, comments, and the usual "
+            "names of columns."
+        ),
+    ],
+    out: Annotated[
+        Path, typer.Option(help="The path that is written, a CSV file for `tlf run`.")
+    ] = Path("path.csv"),
+    columns: Annotated[
+        str | None,
+        typer.Option(
+            help="Columns of time, x and y: three names, or numbers from 1 on, with commas."
+        ),
+    ] = None,
+    units: Annotated[
+        str | None,
+        typer.Option(help="Unit of x and y: m, cm or mm; by default as the header says."),
+    ] = None,
+    smooth: Annotated[
+        float | None,
+        typer.Option(
+            help="Smooth the positions: standard deviation of their noise, mm (e.g. 5 for a camera)."
+        ),
+    ] = None,
+    speed_limit: Annotated[
+        float | None,
+        typer.Option(
+            help="Time the path anew, from rest to rest: largest speed, mm/s; slower in turns, as the tyres "
+            "need it."
+        ),
+    ] = None,
+    figures: Annotated[bool, typer.Option(help="Draw the path.")] = True,
+) -> None:
+    """Make a path that robots can follow of your own log: `tlf path log.csv --units m --smooth 5`."""
+    from baselines.commands.path import path_command
+
+    path_command(
+        log,
+        out,
+        columns=columns,
+        units=units,
+        smooth_mm=smooth,
+        speed_limit_mm_s=speed_limit,
+        figures=figures,
+    )
+
+
 def start_poses(text: str) -> list[list[float]]:
     """Start poses from ``x_mm,y_mm,theta_rad`` of each robot, with ``;`` between.
 

@@ -13,13 +13,13 @@ from baselines.training.curve import kept_evaluation
 from tlf_env.task.metrics import RobotMetrics
 
 RUN_COLUMNS: tuple[tuple[str, str, int], ...] = (
-    ("position RMS\nmm", "position_rmse_mm", 2),
-    ("largest\nmm", "position_max_mm", 1),
-    ("formation RMS\nmm", "formation_rmse_mm", 1),
-    ("heading RMS\nrad", "heading_rmse_rad", 4),
-    ("time gap RMS\ns", "time_gap_rmse_s", 4),
-    ("torque at limit\n% of time", "saturation_fraction", 1),
-    ("largest slip\nmm/s", "slip_max_mm_s", 1),
+    ("error\nRMS\nmm", "position_rmse_mm", 2),
+    ("error\nlargest\nmm", "position_max_mm", 1),
+    ("formation\nRMS\nmm", "formation_rmse_mm", 1),
+    ("heading\nRMS\nrad", "heading_rmse_rad", 4),
+    ("gap\nRMS\ns", "time_gap_rmse_s", 4),
+    ("torque\nat limit\n%", "saturation_fraction", 1),
+    ("slip\nlargest\nmm/s", "slip_max_mm_s", 1),
 )
 
 
@@ -30,8 +30,8 @@ def metrics_table(record: Record) -> Table:
         title=f"{scenario.name}, {record.policy}, disturbance {scenario.disturbance.name}, "
         f"seed {record.seed}",
         caption=f"Errors from {scenario.settle_s:g} s on (formation: from 5 s after the robot sets out). "
-        "Position: to the robot's own reference. Formation: to the leader's path, one time gap later for each "
-        "robot.",
+        "Error: of the position, to the robot's own reference. Formation: to the leader's path, one time gap "
+        "later for each robot. Gap: of the time gap.",
         box=SIMPLE_HEAD,
         collapse_padding=True,
         pad_edge=False,
@@ -51,12 +51,12 @@ def metrics_table(record: Record) -> Table:
 
 
 def verdict(metrics: RobotMetrics, set_out: bool) -> str:
-    """How a run ended for one robot, in words; nothing is held by a robot that has not set out."""
+    """How a run ended for one robot, in words; a robot that has not set out at the end waits."""
     if metrics.lost or metrics.touched:
         parts = ["lost"] if metrics.lost else []
         parts += [f"touched {metrics.touched_by}"] if metrics.touched else []
         return ", ".join(parts)
-    return "held" if set_out else "not set out"
+    return "held" if set_out else "waits"
 
 
 def speed_table(result: dict[str, Any]) -> Table:

@@ -377,8 +377,8 @@ def test_a_start_is_no_loss_on_a_short_run():
     assert not any(robot.lost for robot in found)
     set_out = [i * scenario.time_gap_s < 6.0 for i in range(3)]
     cells = list(metrics_table(record).columns[-1].cells)
-    assert cells == ["held" if one else "not set out" for one in set_out]
-    assert cells.count("not set out") == 1
+    assert cells == ["held" if one else "waits" for one in set_out]
+    assert cells.count("waits") == 1
     standing = run_policy(load_scenario("infinity", horizon_s=20.0, lost_beyond_mm=1e6), Still())
     assert standing.metrics()[0].lost  # the errors after 10 s count
 

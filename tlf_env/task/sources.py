@@ -120,7 +120,7 @@ def _scenario_alone(source: Any, control_period_s: Any) -> dict[str, Any]:
         found = scenario_of_waypoints(
             path, float(control_period_s) if given else DEFAULT_CONTROL_PERIOD_S
         )
-        return {**found, "name": name_of(path)}
+        return {**found, "name": name_of(path), "disturbance": "nominal"}
     found = read_preset_or_file("scenario", source, ", nor a .csv file of waypoints")
     if not is_file_name(source):
         return {"name": str(source), **found}

@@ -81,7 +81,7 @@ def read_points(path: Path) -> tuple[Point, ...]:
         found = shown(",".join(rows[0])) if rows else "nothing" if comment else "an empty file"
         raise ValueError(
             f"{name}, line {lines[0] if rows else 1}: the header must be {','.join(HEADER)}, "
-            f"got {found}{comment}"
+            f"got {found}{comment}; `tlf path` reads logs with other columns, units and delimiters"
         )
     return checked_points(
         [[_parsed(cell) for cell in row] for row in rows[1:]],
