@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import json
 import os
+import shlex
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -33,6 +34,7 @@ from tlf_env.common.errors import install_command
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
+RESUMED = ("bench", "train", "tune")  # commands that go on where they were interrupted
 
 app = typer.Typer(
     help="Time-gap leader-follower formations of wheeled robots that slip.",
@@ -519,6 +521,15 @@ def bench(
         str | None,
         typer.Option(help="Run cases made from this text in place of the published test set."),
     ] = None,
+    check: Annotated[
+        str | None,
+        typer.Option(
+            "--check",
+            metavar="TASK:DISTURBANCE",
+            help="Run a cell of the published board again, for all its entries or those of --policies, and "
+            "compare every digit.",
+        ),
+    ] = None,
     out: Annotated[
         Path | None,
         typer.Option(help="Folder of the results; default results/bench or results/test."),
@@ -530,6 +541,14 @@ def bench(
 ) -> None:
     """Compare policies on the same random draws. Interrupt it, and call it again to continue."""
     names = listed(policies)
+    if check is not None:
+        from baselines.commands.check import check_command
+
+        refuse_beside_test(ctx, "--check")
+        asked_names = names if given(ctx, "policies") else None
+        if not check_command(check, asked_names, out, processes or os.cpu_count() or 1):
+            raise SystemExit(FAILED)
+        return
     if entry:
         names = (*(names if given(ctx, "policies") else ()), *(f"entry:{one}" for one in entry))
     if envelope:
@@ -601,8 +620,8 @@ def bench(
         screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
 
 
-def refuse_beside_test(ctx: typer.Context) -> None:
-    """Refuse options that the cases of the test set have themselves.
+def refuse_beside_test(ctx: typer.Context, option_given: str = "--test") -> None:
+    """Refuse options that the cases of the test set, or a cell of the board, have themselves.
 
     Raises
     ------
@@ -612,7 +631,7 @@ def refuse_beside_test(ctx: typer.Context) -> None:
     for option in ("tasks", "disturbances", "also", "level", "sweep", "horizon_s", "plant"):
         if given(ctx, option):
             raise ValueError(
-                f"--{option.replace('_', '-')} cannot be used with --test: every case has its own"
+                f"--{option.replace('_', '-')} cannot be used with {option_given}: every case has its own"
             )
 
 
@@ -818,10 +837,17 @@ def main() -> None:
     except OSError as error:
         fail(str(error), FAILED)
     except (KeyboardInterrupt, typer.Abort):
-        fail("interrupted", INTERRUPTED)
+        fail(interrupted_message(sys.argv[1:]), INTERRUPTED)
     else:
         if status == INTERRUPTED:  # typer's status after Ctrl-C
-            fail("interrupted", INTERRUPTED)
+            fail(interrupted_message(sys.argv[1:]), INTERRUPTED)
+
+
+def interrupted_message(words: Sequence[str]) -> str:
+    """What is printed after Ctrl-C, with the command that goes on, if that can."""
+    if not words or words[0] not in RESUMED:
+        return "interrupted"
+    return f"interrupted; what is finished is kept, and the same command goes on: tlf {shlex.join(words)}"
 
 
 def fail(message: str, status: int) -> None:

@@ -221,7 +221,9 @@ def test_policies_meet_the_same_starts_and_noise():
 def test_another_plan_in_the_same_folder_is_refused(tmp_path, change):
     run_bench(PLAN, tmp_path)
     before = {path: path.read_bytes() for path in tmp_path.iterdir()}
-    with pytest.raises(ValueError, match=r"holds results with a different 'plan' in plan\.json"):
+    with pytest.raises(
+        ValueError, match=r"holds results with a different 'plan' in plan\.json: plan\."
+    ):
         run_bench(Plan(**(vars(PLAN) | change)), tmp_path)
     assert {path: path.read_bytes() for path in tmp_path.iterdir()} == before
 

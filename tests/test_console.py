@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 
 from baselines import cli, console
+from baselines.runs.jobs import first_difference
 from tlf_env.common.errors import install_command
 
 ROOT = Path(__file__).parent.parent
@@ -125,3 +126,42 @@ def test_names_are_printed_as_they_are(text, capsys):
 def test_every_hint_names_an_extra_that_there_is(file):
     for extra in re.findall(r"tlf-env\[(\w+)\]", file.read_text("utf-8")):
         assert extra in EXTRAS
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (
+            ["bench", "--plan", "my plan.yaml"],
+            "the same command goes on: tlf bench --plan 'my plan.yaml'",
+        ),
+        (["train", "quick"], "the same command goes on: tlf train quick"),
+        (["compile"], "interrupted"),
+        ([], "interrupted"),
+    ],
+)
+def test_an_interruption_names_the_command_that_goes_on(words, said, monkeypatch, capsys):
+    def interrupt(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(cli, "app", interrupt)
+    monkeypatch.setattr("sys.argv", ["tlf", *words])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert stopped.value.code == cli.INTERRUPTED
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.endswith(said)
+
+
+@pytest.mark.parametrize(
+    ("there", "now", "wanted"),
+    [
+        ({"a": 1}, {"a": 2}, ("plan.a", 1, 2)),
+        ({"a": {"b": [1, 2]}}, {"a": {"b": [1, 3]}}, ("plan.a.b.1", 2, 3)),
+        ({"a": [1]}, {"a": [1, 2]}, ("plan.a", [1], [1, 2])),
+        ({"a": 1, "b": 2}, {"a": 1}, ("plan.b", 2, None)),
+        (None, {"a": 1}, ("plan", None, {"a": 1})),
+    ],
+)
+def test_the_first_difference_is_named_with_both_values(there, now, wanted):
+    assert first_difference(there, now, "plan") == wanted

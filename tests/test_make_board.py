@@ -20,6 +20,7 @@ WORDS = "--horizon-s 12 --seeds 20000:20003 --disturbances nominal,start"
 PAGES = (
     "README.md",
     "docs/leaderboard.md",
+    "baselines/benchmark/published.json",
     *(
         f"docs/leaderboard/{name}"
         for name in (

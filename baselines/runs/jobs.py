@@ -15,7 +15,7 @@ from multiprocessing import get_context, parent_process
 from pathlib import Path
 from typing import Any, TypeVar
 
-from tlf_env.common.errors import install_command
+from tlf_env.common.errors import install_command, shown
 from tlf_env.common.files import atomic, read_json
 
 POLLED_EVERY_S = 0.5
@@ -40,7 +40,7 @@ def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) ->
     Raises
     ------
     ValueError
-        naming the first entry that differs, or if the file is damaged.
+        naming what differs first, with both values, or if the file is damaged.
     """
     if not path.exists():
         with atomic(path, encoding="utf-8") as file:
@@ -53,10 +53,24 @@ def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) ->
         raise ValueError(f"{path} is damaged; choose another --out, or remove it") from error
     for key in keys:
         if before.get(key) != record[key]:
+            place, there, now = first_difference(before.get(key), record[key], key)
             raise ValueError(
-                f"{path.parent} holds {what} with a different {key!r} in {path.name}; choose another "
-                "--out, or remove it"
+                f"{path.parent} holds {what} with a different {key!r} in {path.name}: {place} is "
+                f"{shown(there)} there and {shown(now)} now; choose another --out, or remove it"
             )
+
+
+def first_difference(there: Any, now: Any, path: str) -> tuple[str, Any, Any]:
+    """The path of the first difference of two values of JSON, and what each has there; None: nothing."""
+    if isinstance(there, dict) and isinstance(now, dict):
+        for key in dict.fromkeys((*there, *now)):
+            if there.get(key) != now.get(key) or (key in there) != (key in now):
+                return first_difference(there.get(key), now.get(key), f"{path}.{key}")
+    if isinstance(there, list) and isinstance(now, list) and len(there) == len(now):
+        for number, (one, other) in enumerate(zip(there, now, strict=True)):
+            if one != other:
+                return first_difference(one, other, f"{path}.{number}")
+    return path, there, now
 
 
 @contextmanager

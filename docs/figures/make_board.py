@@ -1,10 +1,10 @@
 """Write the pages of a leaderboard from benchmark results: whole systems, or controllers alone.
 
 First run ``tlf bench --plan board --out results/board``, then
-``python docs/figures/make_board.py results/board``: ``docs/leaderboard.md``, ``docs/leaderboard/`` and the
-README's tables. With ``controllers`` in place of ``board`` (and ``--board controllers``):
-``docs/leaderboard-controllers.md`` and its folder. This needs the extras ``bench`` and ``figures``. The
-same results give the same files, byte for byte.
+``python docs/figures/make_board.py results/board``: ``docs/leaderboard.md``, ``docs/leaderboard/``, the
+README's tables and what ``tlf bench --check`` compares with. With ``controllers`` in place of ``board`` (and
+``--board controllers``): ``docs/leaderboard-controllers.md`` and its folder. This needs the extras ``bench``
+and ``figures``. The same results give the same files, byte for byte.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
+from baselines.benchmark.check import PUBLISHED
 from baselines.benchmark.figures import write_bench_figures
 from baselines.benchmark.page import markdown, number
 from baselines.benchmark.plan import Episode, Plan
@@ -233,7 +234,15 @@ def write_board(results: Path, root: Path = ROOT, name: str = "board") -> None:
         folder / "slice.jsonl", "".join(json.dumps(line) + "\n" for line in slice_of(board, lines))
     )
     write_text(folder.with_suffix(".md"), markdown(board, figures))
-    write_text(root / "README.md", readme)
+    if name == "board":
+        write_text(root / "README.md", readme)
+        write_text(root / PUBLISHED.relative_to(ROOT), published_part(board))
+
+
+def published_part(board: Board) -> str:
+    """What ``tlf bench --check`` compares with; it ships with the package."""
+    part = {"plan": board["plan"]["plan"], "cells": board["cells"]}
+    return json.dumps(part, separators=(",", ":"), allow_nan=False) + "\n"
 
 
 def main() -> None:
