@@ -703,45 +703,22 @@ def train(
     ] = False,
 ) -> None:
     """Train one policy per seed. Interrupt it, and call it again to continue to the same result."""
-    from baselines.runs.provenance import command_line
-    from baselines.tables import training_table
     from baselines.training.config import load_config
-    from baselines.training.curve import kept_evaluation
 
     loaded = load_config(config, robot_steps=robot_steps)
     numbers = whole_numbers("seeds", seeds)
     try:
-        from baselines.training.train_seeds import train_seeds
+        from baselines.commands.train import train_command
     except ModuleNotFoundError as error:
         raise ValueError(f"training needs {error.name} ({install_command('train')})") from error
-    name = Path(config).stem
-    folder = writable_folder(out or Path("results/train") / name)
-    warn_of_scenarios(loaded.named_scenarios())
-    warn_of_compiling()
-    with progress_bar(f"train {name}") as update:
-        curves = train_seeds(
-            loaded,
-            numbers,
-            folder,
-            processes=min(processes or os.cpu_count() or 1, len(numbers)),
-            ray_address=ray,
-            command=command_line(sys.argv[1:]),
-            progress=update,
-        )
-    if as_json:
-        rows = [
-            {
-                "seed": curve["seed"],
-                "start": curve["evaluations"][0],
-                "kept": kept_evaluation(curve),
-            }
-            for curve in curves
-        ]
-        typer.echo(json.dumps(rows, indent=1, allow_nan=False))
-        return
-    screen.print(training_table(curves))
-    screen.print(
-        f"In {folder}: policy.safetensors and policy.json of the best seed, seed_N of each seed"
+    train_command(
+        loaded,
+        Path(config).stem,
+        numbers,
+        out=out,
+        processes=processes or os.cpu_count() or 1,
+        ray=ray,
+        as_json=as_json,
     )
 
 

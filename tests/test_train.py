@@ -84,7 +84,7 @@ def test_shipped_configs_are_valid(path: Path):
         ({"disturbances": {"slip": 0}}, "at least one share must be above 0"),
         ({"tasks": {"square": {}}}, "scenario 'square' is not one of"),
         ({"tasks": {"infinity": {"speed": 1}}}, "speed: unknown key"),
-        ({"tasks": {"turned": {"base": "infiniti"}}}, "scenario 'infinty' is not one of"),
+        ({"tasks": {"turned": {"base": "infiniti"}}}, "scenario 'infiniti' is not one of"),
         ({"tasks": {"turned": {"base": 3}}}, "tasks.turned.base 3 must be the name of a scenario"),
         (
             {"network": {"lstm": 8}},
@@ -372,6 +372,31 @@ class TestTraining:
             train(load_config({**CONFIG, "settings": settings}), 0, tmp_path)
 
     @pytest.mark.slow
+    def test_a_training_shows_the_default_and_what_comes_next(self, tmp_path, monkeypatch, capsys):
+        path = tmp_path / "small.yaml"
+        path.write_text(yaml.safe_dump(CONFIG), encoding="utf-8")
+        monkeypatch.setattr("sys.argv", ["tlf", "train", str(path), "--out", str(tmp_path / "out")])
+        main()
+        answer = capsys.readouterr()
+        curve = json.loads((tmp_path / "out/seed_0/curve.json").read_text(encoding="utf-8"))
+        default = json.loads((tmp_path / "out/default.json").read_text(encoding="utf-8"))
+        lines = answer.err.splitlines()
+        assert (
+            f"The default system in the same evaluation: {default['score_mm']:.2f} mm, 0 of 4"
+            in answer.err
+        )
+        for one in curve["evaluations"]:
+            steps = (
+                f"seed 0, {one['robot_steps'] / 1e6:.2f} M robot steps: {one['score_mm']:.2f} mm"
+            )
+            assert sum(line.startswith(steps) for line in lines) == 1
+        policy = tmp_path / "out" / "policy.safetensors"
+        assert f"tlf run infinity --policy {policy}" in answer.out
+        assert f"tensorboard --logdir {tmp_path / 'out'}" in answer.out
+        monkeypatch.setattr("sys.argv", ["tlf", "train", str(path), "--out", str(tmp_path / "out")])
+        main()  # finished: nothing is scored or evaluated again
+        assert "robot steps:" not in capsys.readouterr().err
+
     def test_seeds_side_by_side_are_the_seeds_alone(self, tmp_path, monkeypatch, capsys):
         monkeypatch.setattr("sys.argv", command(tmp_path, "--seeds", "0,1", "--json"))
         main()
@@ -426,3 +451,17 @@ class TestTraining:
         assert first["cells"]["infinity, nominal"]["failed"] == 10
         assert last["cells"]["infinity, nominal"]["failed"] == 0
         assert last["cells"]["infinity, nominal"]["position_rmse_mm"] < 100.0
+
+
+def test_the_default_is_scored_in_the_same_tasks():
+    """With its own action and filter, in the learner's tasks, gaps and disturbances."""
+    config = load_config({**CONFIG, "scenario": {**CONFIG["scenario"], "reward": {"alive": 1.0}}})
+    learners, alone = config.evaluation_scenarios(), config.task_scenarios()
+    assert list(alone) == list(learners)
+    for place, scenario in alone.items():
+        learner = learners[place]
+        for name in ("trajectory", "robots", "time_gap_s", "preview_s", "horizon_s", "plant"):
+            assert getattr(scenario, name) == getattr(learner, name)
+        assert scenario.disturbance == learner.disturbance
+        assert scenario.action == "twist"
+        assert not {"estimator", "action", "reward"} & scenario.model_fields_set

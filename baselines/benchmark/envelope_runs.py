@@ -23,9 +23,9 @@ from baselines.benchmark.envelope import (
     untested,
 )
 from baselines.benchmark.lines import BESIDE, beside
-from baselines.benchmark.results import append_line, read_lines
 from baselines.policies.registry import fit_policy, policy_hash
 from baselines.runs.jobs import claim, spread
+from baselines.runs.jsonl import append_line, read_lines
 from baselines.runs.outcome import failed
 from baselines.runs.provenance import git_revision, physics_digest, simulation_digest, versions
 from baselines.runs.run import run_seeds, seed_blocks

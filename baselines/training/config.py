@@ -24,6 +24,22 @@ SeedsFromTo = tuple[
 ]  # first, end (not run)
 
 
+# Fields of a training's scenario that are the task; all others are the learner's.
+OF_THE_TASK = (
+    BASE,
+    "trajectory",
+    "robots",
+    "robot",
+    "time_gap_s",
+    "start_spacing_mm",
+    "start_ramp_s",
+    "world",
+    "plant",
+    "control_period_s",
+    "preview_s",
+)
+
+
 class NetworkConfig(Frozen):
     """The policy's network; the critic's has the same size."""
 
@@ -164,6 +180,19 @@ class TrainConfig(Frozen):
         for scenario in scenarios.values():
             check_choosing(scenario)
         return scenarios
+
+    def task_scenarios(self) -> dict[tuple[str, str], Scenario]:
+        """As :func:`evaluation_scenarios`, without what belongs to the learner: for another policy."""
+        found = {}
+        for task, own in self.tasks.items():
+            fields = {**self.scenario, **own}
+            kept = {key: value for key, value in fields.items() if key in OF_THE_TASK}
+            alone = self.model_copy(update={"scenario": {}, "tasks": {task: kept}})
+            for name in self.evaluation.disturbances:
+                found[task, name] = alone._scenario(
+                    task, name, None, horizon_s=self.evaluation.horizon_s
+                )
+        return found
 
     def named_scenarios(self) -> list[tuple[str, Scenario]]:
         """Every scenario of the training and of its evaluation, with its task and disturbance."""

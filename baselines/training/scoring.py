@@ -8,8 +8,11 @@ from typing import NamedTuple
 
 import numpy as np
 
+from baselines.policies.registry import fit_policy
 from baselines.runs.outcome import failed
 from baselines.runs.run import run_seeds
+from baselines.training.config import TrainConfig
+from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario
 
@@ -37,6 +40,17 @@ def score_policy(
         f"{task}, {disturbance}": score_scenario(policy, scenario, seeds)
         for (task, disturbance), scenario in scenarios.items()
     }
+
+
+def score_default(config: TrainConfig) -> dict[str, ScenarioScore]:
+    """Score of the default system in the evaluation of a training: what a policy is to be compared with."""
+    name = f"reference:{DEFAULT_CONTROLLER}"
+    seeds = range(*config.evaluation.seeds)
+    found = {}
+    for place, scenario in config.task_scenarios().items():
+        fitted = fit_policy(name, scenario)
+        found[", ".join(place)] = score_scenario(fitted.policy, fitted.scenario, seeds)
+    return found
 
 
 def overall_mm(scores: Mapping[str, ScenarioScore]) -> float:

@@ -54,6 +54,7 @@ def train(
     command: str = "",
     threads: int = 1,
     progress: Callable[[int, int], None] | None = None,
+    evaluated: Callable[[dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Train with one seed, from the folder's checkpoint if there is one, and keep the best policy.
 
@@ -72,6 +73,8 @@ def train(
         Threads that step the formations; their number changes no result.
     progress
         Called with the robot steps done and their total.
+    evaluated
+        Called with each evaluation, as ``curve.json`` has it.
 
     Returns
     -------
@@ -88,7 +91,7 @@ def train(
     torch.set_num_threads(1)  # small networks: more threads would cost more than they gain
     check_folder(config, seed, folder)
     with alone_in(folder):
-        return _train(config, seed, folder, command, threads, progress)
+        return _train(config, seed, folder, command, threads, progress, evaluated)
 
 
 def _train(
@@ -98,7 +101,13 @@ def _train(
     command: str,
     threads: int,
     progress: Callable[[int, int], None] | None,
+    evaluated: Callable[[dict[str, Any]], None] | None,
 ) -> dict[str, Any]:
+    def evaluate() -> None:
+        evaluate_and_keep(model, config, seed, folder, done, command)
+        if evaluated is not None:
+            evaluated(done.evaluations[-1])
+
     started = time.perf_counter()
     envs = make_envs(config, threads)
     model = make_model(config, envs, seed)
@@ -112,7 +121,7 @@ def _train(
         spread_out(model, envs, config.seeds[0])
         if config.imitation is not None:
             imitate(model, envs, config)
-        evaluate_and_keep(model, config, seed, folder, done, command)
+        evaluate()
     began = started - done.wall_time_s
     with interrupts() as stop:
         while model.num_timesteps < config.robot_steps:
@@ -123,7 +132,7 @@ def _train(
             record_rollout(model, done)
             raise_level(envs, config, done)
             if last or passed(config.evaluation.every, before, now):
-                evaluate_and_keep(model, config, seed, folder, done, command)
+                evaluate()
             done.wall_time_s = time.perf_counter() - began
             if progress is not None:
                 progress(min(now, config.robot_steps), config.robot_steps)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -9,12 +10,14 @@ from typing import Any, NamedTuple
 
 from baselines.policies.card import CARD
 from baselines.runs.jobs import spread
+from baselines.runs.jsonl import append_line
 from baselines.training.config import TrainConfig
 from baselines.training.curve import kept_evaluation
 from baselines.training.train import POLICY_FILE, check_folder, train
 from tlf_env.common.files import atomic
 
 STEPS_FILE = "robot_steps"  # holds the robot steps that a training has done
+EVALUATIONS_FILE = "evaluations.jsonl"  # a line for each evaluation of a training, as it learns
 
 
 class SharedByAllSeeds(NamedTuple):
@@ -35,6 +38,7 @@ def train_seeds(
     ray_address: str | None = None,
     command: str = "",
     progress: Callable[[int, int], None] | None = None,
+    evaluated: Callable[[int, dict[str, Any]], None] | None = None,
 ) -> list[dict[str, Any]]:
     """Train with several seeds, each in ``folder/seed_N``; the best policy goes to ``folder``.
 
@@ -44,6 +48,8 @@ def train_seeds(
         Seeds at a time on this machine; they share its cores.
     progress
         Called with the robot steps done over all seeds, and their total.
+    evaluated
+        Called with a seed and each of its evaluations, as it learns.
 
     Returns
     -------
@@ -62,9 +68,16 @@ def train_seeds(
         check_folder(config, seed, place)
     total = config.robot_steps * len(places)
 
+    seen = {seed: len(_evaluations(place)) for seed, place in places.items()}  # of earlier calls
+
     def report() -> None:
         if progress is not None:
             progress(sum(_steps_done(place) for place in places.values()), total)
+        for seed, place in places.items():
+            for one in _evaluations(place)[seen[seed] :]:
+                seen[seed] += 1
+                if evaluated is not None:
+                    evaluated(seed, one)
 
     def train_and_report(shared: SharedByAllSeeds, seed: int) -> dict[str, Any]:
         return _train_one(shared, seed, report)
@@ -81,6 +94,7 @@ def train_seeds(
         meanwhile=report,
     ):
         curves[curve["seed"]] = curve
+    report()
     best = min(curves, key=lambda seed: kept_evaluation(curves[seed])["score_mm"])
     for name in (POLICY_FILE, str(Path(POLICY_FILE).with_suffix(CARD))):
         with atomic(folder / name, "wb") as file:
@@ -99,6 +113,10 @@ def _train_one(
             file.write(f"{done}\n")
         report()
 
+    def evaluated(one: dict[str, Any]) -> None:
+        append_line(folder / EVALUATIONS_FILE, one)
+        report()
+
     return train(
         shared.config,
         seed,
@@ -106,7 +124,19 @@ def _train_one(
         command=shared.command,
         threads=shared.threads,
         progress=progress,
+        evaluated=evaluated,
     )
+
+
+def _evaluations(place: Path) -> list[dict[str, Any]]:
+    """The evaluations of a training so far; of a line that is being written nothing."""
+    try:
+        text = (place / EVALUATIONS_FILE).read_text(encoding="utf-8")
+    except OSError:
+        return []
+    whole = map(json.loads, text[: text.rfind("\n") + 1].splitlines())
+    # An evaluation after the last checkpoint is repeated when the training goes on.
+    return list({one["robot_steps"]: one for one in whole}.values())
 
 
 def _steps_done(folder: Path) -> int:
