@@ -677,6 +677,51 @@ def bench_test(
 
 
 @app.command()
+def export(
+    tasks: Annotated[str, typer.Argument(help="Tasks, comma-separated (see `tlf list tasks`).")],
+    policy: Annotated[
+        str, typer.Option(help="As in `tlf run --policy`.", autocompletion=completed("policies"))
+    ] = f"reference:{DEFAULT_CONTROLLER}",
+    disturbances: Annotated[
+        str, typer.Option(help="Disturbances, comma-separated: presets or FILE.yaml.")
+    ] = "nominal",
+    seeds: Annotated[str, typer.Option(help="Seeds FIRST:END; END itself is not run.")] = "0:20",
+    horizon_s: Annotated[float | None, typer.Option(help="Length of each episode, s.")] = None,
+    form: Annotated[str, typer.Option(help="parquet (a plain table) or minari.")] = "parquet",
+    joint: Annotated[
+        bool,
+        typer.Option(
+            "--joint", help="One episode for each formation in place of one for each robot."
+        ),
+    ] = False,
+    name: Annotated[str, typer.Option(help="Name of the data set.")] = "dataset",
+    out: Annotated[Path, typer.Option(help="Folder of the data set.")] = Path("results/data"),
+    trust: Annotated[
+        bool,
+        typer.Option(
+            "--trust",
+            help="Load an SB3 .zip file or run an entry's program: code that they contain.",
+        ),
+    ] = False,
+) -> None:
+    """Write runs as a data set for offline learning: observations, actions and rewards of every robot."""
+    from baselines.commands.export import export_command
+
+    export_command(
+        tasks,
+        disturbances,
+        policy,
+        seeds,
+        horizon_s=horizon_s,
+        form=form,
+        joint=joint,
+        name=name,
+        out=out,
+        trust=trust,
+    )
+
+
+@app.command()
 def train(
     config: Annotated[
         str,

@@ -51,8 +51,11 @@ class NetworkConfig(Frozen):
 
 
 class ImitationConfig(Frozen):
-    """Imitation of the reference before the training; PPO with twists from ``tracking`` only."""
+    """Imitation before the training, of the reference or of a data set; PPO only."""
 
+    # A file of `tlf export`, whose actions are imitated; None: the reference drives, with twists from
+    # `tracking`.
+    data: str | None = None
     controller: str = "tuned"  # gains of the reference, without its limits on accelerations
     robot_steps: Count = 600_000  # over all rounds
     rounds: Count = 1  # the reference drives in the first round, the network in the others
@@ -115,6 +118,10 @@ class TrainConfig(Frozen):
             )
         if self.imitation is not None and self.algorithm != "PPO":
             raise ValueError(f"imitation needs algorithm PPO, got {self.algorithm}")
+        if self.imitation is not None and self.imitation.data and self.imitation.rounds > 1:
+            raise ValueError(
+                "imitation.rounds needs a reference that drives; with data it must be 1"
+            )
         if self.curriculum is not None and (
             len(self.levels) < 2 or list(self.levels) != sorted(set(self.levels))
         ):
@@ -238,7 +245,11 @@ def level_of(disturbance: str) -> tuple[str, float | None]:
 
 
 def _place_files(data: dict[str, Any], folder: Path) -> None:
-    """Replace the files in the configuration's folder, of disturbances and bases, by their paths."""
+    """Replace the files in the configuration's folder by their paths: disturbances, bases, data."""
+    imitation = data.get("imitation")
+    if isinstance(imitation, dict) and isinstance(imitation.get("data"), str):
+        beside_it = folder / imitation["data"]
+        imitation["data"] = str(beside_it) if beside_it.is_file() else imitation["data"]
     tasks = data.get("tasks")
     for own in tasks.values() if isinstance(tasks, dict) else ():
         if isinstance(own, dict) and BASE in own:

@@ -2,16 +2,20 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
 import torch
 
+from baselines.data.episodes import entry_names
+from baselines.data.files import read_rows
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.registry import check_interface
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import ImitationConfig, TrainConfig
 from tlf_env.onboard.controllers import controller
+from tlf_env.task.scenario import Scenario
 
 BATCH = 2048
 
@@ -25,7 +29,10 @@ class Rows(NamedTuple):
 
 
 def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
-    """Fit a PPO model to the reference that ``config.imitation`` names (the teacher); its critic, too.
+    """Fit a PPO model to a data set or to the reference that ``config.imitation`` names; its critic, too.
+
+    With a data set the network is fitted to its actions, and the critic to the discounted rewards that
+    followed. Otherwise the reference is the teacher.
 
     In the first round the teacher drives all formations, with noise on its actions so that the data
     contain its corrections. The network is fitted to the teacher's actions, and the critic to the
@@ -37,11 +44,16 @@ def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
     Raises
     ------
     ValueError
-        if the reference does not fit the scenario.
+        if the reference or the data do not fit the scenario, or the file cannot be read.
     """
     wanted = config.imitation
     assert wanted is not None
     scenario = envs.plants[0].scenario
+    if wanted.data is not None:
+        given = _from_data(Path(wanted.data), scenario, float(model.gamma))
+        seen, meant, returns = map(torch.from_numpy, given)
+        _fit(model, seen, meant, returns, wanted.epochs, wanted.learning_rate)
+        return
     check_interface("the teacher", scenario, action="twist", observation="tracking")
     known = controller(wanted.controller)
     free = {"acceleration_mm_s2": None, "yaw_acceleration_rad_s2": None}
@@ -56,6 +68,24 @@ def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
             torch.from_numpy(np.concatenate(one)) for one in zip(*rows, strict=True)
         )
         _fit(model, seen, meant, returns, wanted.epochs, wanted.learning_rate)
+
+
+def _from_data(path: Path, scenario: Scenario, gamma: float) -> Rows:
+    """The rows of a data set, which must have the scenario's observation and action."""
+    data = read_rows(path)
+    mine = (scenario.action, entry_names(scenario))
+    if (data.about.action, data.about.entries) != mine:
+        raise ValueError(
+            f"{path} has {len(data.about.entries)} entries of {data.about.observation!r} observations and "
+            f"{data.about.action!r} actions; the scenario has {len(mine[1])} of {scenario.observation!r} and "
+            f"{scenario.action!r}"
+        )
+    returns = np.empty(len(data.rewards), dtype=np.float32)
+    following = 0.0
+    for k in reversed(range(len(returns))):
+        following = data.rewards[k] + gamma * (0.0 if data.last[k] else following)
+        returns[k] = following
+    return Rows(data.observations, data.actions, returns)
 
 
 def _drive(

@@ -28,7 +28,17 @@ ROOMS = (
     "tlf_env.numerics",
     "tlf_env.common",
 )
-WINGS = ("commands", "policies", "runs", "paths", "benchmark", "training", "tuning", "speed")
+WINGS = (
+    "commands",
+    "policies",
+    "runs",
+    "paths",
+    "data",
+    "benchmark",
+    "training",
+    "tuning",
+    "speed",
+)
 
 
 def room_of(module: str) -> str | None:
