@@ -27,7 +27,7 @@ from tlf_env import load_scenario
 from tlf_env.rendering.looks import CRATE, MOVER, SLIPPERY, WALL
 
 ALL = {"overview", "paths", "errors", "functionals", "wheels", "slip", "time_gap"}
-UNITS = ("mm", "s", "rad", "mm/s", "rad/s", "N·mm", "mm·s", "rad·s")
+UNITS = ("%", "mm", "s", "rad", "mm/s", "rad/s", "N·mm", "mm·s", "rad·s")
 PNG = b"\x89PNG"
 
 
@@ -145,7 +145,7 @@ def test_a_run_is_drawn_alike_every_time_and_in_every_format(tmp_path: Path) -> 
 
 @pytest.mark.parametrize("kind", ["1", "3", "lost"])
 def test_every_axis_has_a_unit(kind: str) -> None:
-    with_unit = re.compile(rf" \(({'|'.join(UNITS)})\)(\nsymlog)?$")
+    with_unit = re.compile(rf" \(({'|'.join(UNITS)})\)$")
     for name, draw in figures.FIGURES.items():
         if name == "time_gap" and kind == "1":
             continue
@@ -157,7 +157,7 @@ def test_every_axis_has_a_unit(kind: str) -> None:
 
 
 @pytest.mark.parametrize("kind", ["1", "3", "lost"])
-def test_an_axis_is_labelled_symlog_if_and_only_if_it_is(kind: str) -> None:
+def test_a_scale_that_is_linear_in_part_says_so(kind: str) -> None:
     panels = [
         axes
         for name, draw in figures.FIGURES.items()
@@ -167,7 +167,12 @@ def test_an_axis_is_labelled_symlog_if_and_only_if_it_is(kind: str) -> None:
     scales = {axes.get_yscale() for axes in panels}
     assert {"linear", "log", "symlog"} <= scales
     for axes in panels:
-        assert axes.get_ylabel().endswith("\nsymlog") == (axes.get_yscale() == "symlog")
+        notes = [text.get_text() for text in axes.texts if text.get_text().startswith("scale")]
+        if axes.get_yscale() == "symlog":
+            linear = axes.yaxis.get_transform().linthresh
+            assert notes == [f"scale: linear within ±{linear:g}, log beyond"]
+        else:
+            assert notes == []
 
 
 @pytest.mark.parametrize("n", [1, 3, 10])
@@ -177,7 +182,7 @@ def test_every_robot_has_its_lines(n: int) -> None:
         axes = figures.FIGURES[name](run).axes
         assert [len(robot_lines(panel)) for panel in axes] == [n] * panels
     assert len(robot_lines(figures.paths(run).axes[0])) == n
-    assert [len(axes.lines) for axes in figures.wheels(run).axes] == [2, 2, 1, 1] * n
+    assert [len(axes.lines) for axes in figures.wheels(run).axes] == [2, 2, 1, 1, 1] * n
     assert len(figures.slip(run).axes) == n
     if n > 1:
         gaps = figures.time_gap(run).axes
@@ -185,6 +190,13 @@ def test_every_robot_has_its_lines(n: int) -> None:
         assert [axes.get_ylabel().split("\n")[0] for axes in gaps] == [
             f"robot {i}" for i in range(1, n)
         ]
+
+
+def test_robots_beyond_the_markers_have_other_lines() -> None:
+    """Colour, marker and line together are different for each of 20 robots."""
+    lines = robot_lines(figures.errors(record("20")).axes[0])
+    looks = {(line.get_marker(), line.get_linestyle()) for line in lines}
+    assert len(lines) == len(looks) == 20
 
 
 def test_lines_show_what_was_recorded() -> None:
@@ -195,7 +207,11 @@ def test_lines_show_what_was_recorded() -> None:
     ):
         np.testing.assert_array_equal(line.get_ydata(), run["position_error_mm"][:, i])
         np.testing.assert_array_equal(other.get_ydata(), run["heading_error_rad"][:, i])
-    left, _, torque, _ = figures.wheels(run).axes[4:8]
+    left, _, torque, _, share = figures.wheels(run).axes[5:10]
+    # A mean over 1 s in the middle of the run, within the record's own steps.
+    k, half = len(run.t_s) // 2, round(0.5 / run.scenario.control_period_s)
+    mean = 100 * run["saturation_fraction"][k - half : k + half + 1, 1].mean()
+    assert share.lines[0].get_ydata()[k] == pytest.approx(mean, abs=3.0)
     np.testing.assert_array_equal(left.lines[0].get_ydata(), run["omega_l_command_rad_s"][:, 1])
     np.testing.assert_array_equal(left.lines[1].get_ydata(), run["omega_l_rad_s"][:, 1])
     np.testing.assert_array_equal(torque.lines[0].get_ydata(), run["torque_l_Nmm"][:, 1])
@@ -284,7 +300,7 @@ def test_robots_are_drawn_at_the_snapshots_and_each_time_is_named_once(kind: str
 def test_every_robot_is_drawn_with_its_own_measures() -> None:
     run = record("mixed")
     models = run.scenario.robot_models
-    rows = [figures.wheels(run).axes[4 * i : 4 * i + 4] for i in range(3)]
+    rows = [figures.wheels(run).axes[5 * i : 5 * i + 4] for i in range(3)]
     bands = [[axes.patches[0] for axes in row[2:]] for row in rows]
     for model, row, two in zip(models, rows, bands, strict=True):
         limit = model.torque_limit_Nmm

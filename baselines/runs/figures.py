@@ -15,6 +15,7 @@ from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Patch
 from matplotlib.ticker import NullLocator
+from scipy.ndimage import uniform_filter1d
 
 from baselines.runs.panels import (
     has_time_gap,
@@ -40,6 +41,7 @@ from baselines.runs.style import DPI, METADATA, PALE, tidy
 from baselines.runs.world import world_handles
 from tlf_env.common.files import atomic
 
+SATURATION_WINDOW_S = 1.0
 COMMAND_COLOUR, ACTUAL_COLOUR = "#E69F00", "#0072B2"
 
 
@@ -130,8 +132,9 @@ def functionals(record: Record) -> Figure:
 
 
 def wheels(record: Record) -> Figure:
-    """Wheel speeds, commanded and actual, and torques within their limits, a row for each robot."""
-    figure, rows = robot_rows(record, 0, 13.0, columns=4)
+    """Wheel speeds, commanded and actual, torques within their limits, and how often they are at them."""
+    figure, rows = robot_rows(record, 0, 15.5, columns=5)
+    window = max(1, round(SATURATION_WINDOW_S / record.scenario.control_period_s))
     columns = [f"omega_{side}{kind}_rad_s" for kind in ("_command", "") for side in "lr"]
     speeds = np.stack([record[column] for column in columns])
     margin = 0.05 * max(float(np.ptp(speeds)), 1e-3)
@@ -143,14 +146,19 @@ def wheels(record: Record) -> Figure:
             axes.plot(*thinned(record.t_s, actual[:, i]), color=ACTUAL_COLOUR, lw=0.9)
             axes.set_ylim(speeds.min() - margin, speeds.max() + margin)
             axes.set_ylabel(f"robot {i}\nspeed (rad/s)" if side == "l" else "speed (rad/s)")
-        for axes, side in zip(row[2:], "lr", strict=True):
+        for axes, side in zip(row[2:4], "lr", strict=True):
             torque = thinned(record.t_s, record[f"torque_{side}_Nmm"][:, i])
             axes.axhspan(-limit, limit, color=PALE, lw=0, zorder=0)
             axes.plot(*torque, color=ACTUAL_COLOUR, lw=0.5)
             axes.set_yticks([-limit, 0, limit])
             axes.set_ylim(-1.2 * limit, 1.2 * limit)
             axes.set_ylabel("torque (N·mm)")
-    for k, name in enumerate(("left speed", "right speed", "left torque", "right torque")):
+        share = uniform_filter1d(100.0 * record["saturation_fraction"][:, i], window)
+        row[4].plot(*thinned(record.t_s, share), color=ACTUAL_COLOUR, lw=0.9)
+        row[4].set_ylim(-5, 105)
+        row[4].set_ylabel("saturated (%)")
+    names = ("left speed", "right speed", "left torque", "right torque", "saturated, mean over 1 s")
+    for k, name in enumerate(names):
         rows[0][k].set_title(name, fontsize="medium")
     where = f"±{limits[0]:g} N·mm" if len(set(limits)) == 1 else "the band's edges"
     handles = [

@@ -10,6 +10,7 @@ from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
+from matplotlib.patheffects import withStroke
 from matplotlib.ticker import NullLocator
 
 from baselines.runs.run import Record
@@ -17,6 +18,7 @@ from baselines.runs.style import GREY, MARKERS, hex_colour, tidy
 from tlf_env.task.measures import TIME_GAP_WINDOW_S
 
 MARKERS_PER_LINE = 7
+LINES = ("-", "--", "-.", ":")  # the next after as many robots as there are markers
 MOST_POINTS = 4000  # per line: more are not visible
 NARROWEST_IN = 6.0  # of a figure, so that its title takes two lines at most
 ROW_IN = 1.25  # height of a robot's row
@@ -110,6 +112,7 @@ def robot_line(
         unbroken(values, jump),
         color=robot_colour(record, robot),
         lw=1.0,
+        ls=LINES[robot // len(MARKERS) % len(LINES)],
         marker=MARKERS[robot % len(MARKERS)],
         markevery=(every * (robot + 1) // (record.robots + 1), every),
         ms=4.5,
@@ -139,8 +142,21 @@ def legend_below(figure: Figure, handles: Sequence[Artist], columns: int = 7) ->
 
 
 def name_axis(axes: Axes, text: str) -> None:
-    """Label the vertical axis, and add ``symlog`` if its scale is symmetric-logarithmic."""
-    axes.set_ylabel(text + ("\nsymlog" if axes.get_yscale() == "symlog" else ""))
+    """Label the vertical axis, and say where its scale is linear if it is logarithmic beyond."""
+    named_before = bool(axes.get_ylabel())
+    axes.set_ylabel(text)
+    if axes.get_yscale() == "symlog" and not named_before:
+        linear = getattr(axes.yaxis.get_transform(), "linthresh", 0.0)
+        axes.annotate(
+            f"scale: linear within ±{linear:g}, log beyond",
+            (0.995, 0.98),
+            xycoords="axes fraction",
+            ha="right",
+            va="top",
+            fontsize="x-small",
+            color=GREY,
+            path_effects=[withStroke(linewidth=2, foreground="white")],
+        )
 
 
 def time_axis(record: Record, axes: Axes, start_s: float = 0.0) -> None:

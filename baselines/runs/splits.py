@@ -14,7 +14,7 @@ TEST_SET = "test-set"  # the names of the test set's cases begin so
 TRAINING_FAMILIES = {
     "without": ("none", "nominal"),
     "slip": ("slip", "slip-ramps", "slip-noise"),
-    "grip": ("ice", "split-ice", "patches"),
+    "grip": ("ice", "split-ice", "split-ice-right", "patches"),
     "floor": ("slope",),
     "fixes": ("noise", "fixes-100hz", "fixes-camera", "fixes-uwb"),
     "wheels and gyro": ("encoders-1024", "encoders-4096", "gyro", "calibration"),
