@@ -213,6 +213,7 @@ PRESETS = {
     },
     "ice": {"tyre.friction_scale": 0.5},
     "split-ice": {"tyre.friction_left": 0.6},
+    "split-ice-right": {"tyre.friction_right": 0.6},
     "patches": {},
     "creep": {"tyre.creep": 0.1},
     "rolling": {"floor.rolling_resistance": 0.004},
