@@ -13,7 +13,7 @@ from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.scenario import Scenario
 
 
-class Episode(NamedTuple):
+class RobotEpisode(NamedTuple):
     """One robot from the start to the end, or all robots of a formation together.
 
     The observation of step ``k`` and the action that followed have the same index; there is one observation
@@ -39,7 +39,9 @@ def entry_names(scenario: Scenario) -> list[str]:
     return list(tracking_entries(scenario.preview_s, scenario.rays, scenario.neighbour))
 
 
-def robots_of(scenario: Scenario, policy: Policy, seed: int, name: str = "policy") -> list[Episode]:
+def robots_of(
+    scenario: Scenario, policy: Policy, seed: int, name: str = "policy"
+) -> list[RobotEpisode]:
     """An episode for each robot of one formation, driven by a policy in the parallel environment.
 
     Raises
@@ -67,7 +69,7 @@ def robots_of(scenario: Scenario, policy: Policy, seed: int, name: str = "policy
     observations, actions_of = np.stack(seen), np.stack(acted)
     rewards_of = np.array(rewarded, dtype=np.float64)
     return [
-        Episode(
+        RobotEpisode(
             task=scenario.name,
             disturbance=scenario.disturbance.name,
             seed=seed,
@@ -82,7 +84,7 @@ def robots_of(scenario: Scenario, policy: Policy, seed: int, name: str = "policy
     ]
 
 
-def together(robots: Sequence[Episode]) -> Episode:
+def together(robots: Sequence[RobotEpisode]) -> RobotEpisode:
     """The robots of one formation as one episode."""
     first = robots[0]
     ended = any(one.terminated for one in robots)
@@ -98,7 +100,7 @@ def together(robots: Sequence[Episode]) -> Episode:
 
 def collected(
     scenarios: Sequence[tuple[Scenario, Policy]], seeds: Sequence[int], name: str, *, joint: bool
-) -> Iterator[Episode]:
+) -> Iterator[RobotEpisode]:
     """Episodes of every scenario and seed, those of a formation one after another."""
     for scenario, policy in scenarios:
         for seed in seeds:

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 
-from baselines.data.episodes import Episode
+from baselines.data.episodes import RobotEpisode
 from tlf_env.common.errors import install_command, path_text
 from tlf_env.common.files import atomic
 
@@ -45,7 +45,7 @@ class Rows(NamedTuple):
     about: About
 
 
-def write_parquet(episodes: Sequence[Episode], about: About, path: Path) -> None:
+def write_parquet(episodes: Sequence[RobotEpisode], about: About, path: Path) -> None:
     """Write a row for each robot and step; the last observation of an episode has a row without an action.
 
     Raises
@@ -63,7 +63,7 @@ def write_parquet(episodes: Sequence[Episode], about: About, path: Path) -> None
         pq.write_table(whole, file)
 
 
-def _columns(number: int, episode: Episode, entries: Sequence[str]) -> dict[str, Any]:
+def _columns(number: int, episode: RobotEpisode, entries: Sequence[str]) -> dict[str, Any]:
     steps = len(episode.actions)
     flags = np.zeros((2, steps + 1), dtype=np.bool_)
     flags[:, steps - 1] = episode.terminated, episode.truncated
@@ -81,7 +81,7 @@ def _columns(number: int, episode: Episode, entries: Sequence[str]) -> dict[str,
     }
 
 
-def _apart(episode: Episode) -> list[Episode]:
+def _apart(episode: RobotEpisode) -> list[RobotEpisode]:
     """A joint episode as one for each robot, with the joint reward."""
     return [
         episode._replace(
@@ -124,7 +124,7 @@ def read_rows(path: Path) -> Rows:
 
 
 def write_minari(
-    episodes: Sequence[Episode],
+    episodes: Sequence[RobotEpisode],
     about: About,
     space: gymnasium.spaces.Box,
     folder: Path,
