@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run compile test test-slow test-learning check check-lowest check-clients format board speed speed-docs constraints clean
+.PHONY: help run compile test test-slow test-learning check check-install check-lowest check-clients format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -57,9 +57,24 @@ check-lowest: ## Run the tests with the lowest versions that pyproject.toml allo
 	"$$uv" venv -q --python "$(PYTHON)" "$$VIRTUAL_ENV"; \
 	"$$uv" pip install -q "torch==$(TORCH)"; \
 	"$$uv" pip install -q --resolution lowest-direct \
-		-e ".[figures,view,train,tune,mpc,bench,peers,ray,benchmarl,dev]"; \
+		-e ".[bench,benchmarl,data,dev,figures,mpc,peers,ray,train,tune,view]"; \
 	"$$uv" pip check; \
 	"$$VIRTUAL_ENV/bin/python" -m pytest $(TESTS)
+
+# EXTRAS: all-train tries a training, too.
+EXTRAS ?= bench,data,figures
+check-install: ## Build sdist and wheel, and play the first hour in a clean environment outside the checkout
+	@set -e; \
+	tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \
+	$(PYTHON) -m venv "$$tmp/tools"; \
+	"$$tmp/tools/bin/python" -m pip install -q --disable-pip-version-check build twine; \
+	"$$tmp/tools/bin/python" -m build --outdir "$$tmp/dist" .; \
+	"$$tmp/tools/bin/python" -m twine check --strict "$$tmp"/dist/*; \
+	$(PYTHON) -m venv "$$tmp/venv"; \
+	"$$tmp/venv/bin/python" -m pip install -q --disable-pip-version-check -c constraints.txt \
+		"$$(ls "$$tmp"/dist/*.whl)[$(EXTRAS)]"; \
+	mkdir "$$tmp/elsewhere"; cd "$$tmp/elsewhere"; \
+	PATH="$$tmp/venv/bin:$$PATH" sh "$(CURDIR)/tests/first_hour.sh"
 
 # Their requirements exclude each other. CLIENT names the library whose absence is an error, not a skipped test.
 check-clients: ## Run the tests with other libraries, each of CLIENTS in a temporary environment
@@ -97,7 +112,7 @@ constraints: ## Update constraints.txt from a temporary environment with every e
 	$(PYTHON) -m venv "$$tmp/venv"; \
 	py="$$tmp/venv/bin/python"; \
 	"$$py" -m pip install -q --disable-pip-version-check "torch==$(TORCH)" \
-		build editables hatchling ".[figures,view,train,tune,mpc,bench,peers,ray,benchmarl,dev]"; \
+		build editables hatchling ".[bench,benchmarl,data,dev,figures,mpc,peers,ray,train,tune,view]"; \
 	"$$py" -m pip check; \
 	echo "# Versions of everything that the extras install. Made by: make constraints" > "$$tmp/new"; \
 	"$$py" -m pip freeze --all --exclude pip --exclude tlf-env > "$$tmp/frozen"; \
@@ -119,7 +134,7 @@ $(VENV)/.stamp-run: $(VENV)/.stamp-venv pyproject.toml constraints.txt
 
 # mpe2 instead of the extra `peers`, because that also installs vmas and with it torch.
 $(VENV)/.stamp-test: $(VENV)/.stamp-run
-	$(PIP) -c constraints.txt -e ".[figures,view,bench,tune,mpc,dev]" mpe2
+	$(PIP) -c constraints.txt -e ".[bench,data,figures,mpc,tune,view,dev]" mpe2
 	@touch $@
 
 $(VENV)/.stamp-train: $(VENV)/.stamp-test

@@ -16,7 +16,9 @@ from packaging.utils import canonicalize_name
 ROOT = Path(__file__).parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
 EXTRAS: dict[str, list[str]] = PROJECT["optional-dependencies"]
-REQUIREMENTS = [Requirement(line) for line in sum(EXTRAS.values(), PROJECT["dependencies"])]
+EVERYTHING = [Requirement(line) for line in sum(EXTRAS.values(), PROJECT["dependencies"])]
+OURS = [one for one in EVERYTHING if one.name == PROJECT["name"]]  # extras made of other extras
+REQUIREMENTS = [one for one in EVERYTHING if one not in OURS]
 PINS = {
     canonicalize_name(name): version
     for name, version in re.findall(
@@ -37,11 +39,26 @@ def test_the_workflow_runs_every_check() -> None:
     ]
     run = [step["run"] for job in jobs.values() for step in job["steps"] if "run" in step]
     targets = {command.split()[1] for command in run}
-    assert targets == {"test", "test-learning", "check-lowest", "check-clients"}
+    assert targets == {
+        "test",
+        "test-learning",
+        "check-install",
+        "check-lowest",
+        "check-clients",
+    }
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
     clients = sorted(path.stem for path in (ROOT / "tests" / "clients").glob("*.txt"))
     assert jobs["clients"]["strategy"]["matrix"]["client"] == clients
+
+
+def test_the_extra_all_has_everything_but_torch() -> None:
+    (everything,) = (one for one in OURS if "train" not in one.extras)
+    with_torch = {"train", "benchmarl", "peers"}  # these install it
+    others = {"dev", "ray", "all", "all-train"}
+    assert everything.extras == set(EXTRAS) - with_torch - others
+    (with_training,) = (one for one in OURS if "train" in one.extras)
+    assert with_training.extras == {"all", "train"}
 
 
 def test_the_extra_view_makes_videos_too() -> None:
