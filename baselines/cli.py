@@ -125,6 +125,12 @@ SETTINGS = typer.Option(
 )
 
 
+RAY = typer.Option(help="Address of an existing Ray cluster to run on instead.")
+TRUST = typer.Option(
+    "--trust", help="Load SB3 .zip files and run entries' programs: code that they contain."
+)
+
+
 @app.command()
 def show(
     scenario: Annotated[str, SCENARIO],
@@ -208,13 +214,7 @@ def run(
         bool, typer.Option("--parquet", help="Write trajectory.parquet, too (needs pyarrow).")
     ] = False,
     mat: Annotated[bool, typer.Option("--mat", help="Write trajectory.mat, too.")] = False,
-    trust: Annotated[
-        bool,
-        typer.Option(
-            "--trust",
-            help="Load an SB3 .zip file or run an entry's program: code that they contain.",
-        ),
-    ] = False,
+    trust: Annotated[bool, TRUST] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json instead of the table.")
     ] = False,
@@ -483,15 +483,8 @@ def bench(
         typer.Option(help="pymunk, batch (seeds side by side, no contact), kinematic or chipmunk."),
     ] = None,
     processes: Annotated[int, typer.Option(help="Processes on this machine; 0: one per core.")] = 0,
-    ray: Annotated[
-        str | None, typer.Option(help="Address of an existing Ray cluster to run on instead.")
-    ] = None,
-    trust: Annotated[
-        bool,
-        typer.Option(
-            "--trust", help="Load SB3 .zip files and run entries' programs: code that they contain."
-        ),
-    ] = False,
+    ray: Annotated[str | None, RAY] = None,
+    trust: Annotated[bool, TRUST] = False,
     plan: Annotated[
         str | None,
         typer.Option(
@@ -696,13 +689,7 @@ def export(
     ] = False,
     name: Annotated[str, typer.Option(help="Name of the data set.")] = "dataset",
     out: Annotated[Path, typer.Option(help="Folder of the data set.")] = Path("results/data"),
-    trust: Annotated[
-        bool,
-        typer.Option(
-            "--trust",
-            help="Load an SB3 .zip file or run an entry's program: code that they contain.",
-        ),
-    ] = False,
+    trust: Annotated[bool, TRUST] = False,
 ) -> None:
     """Write runs as a data set for offline learning: observations, actions and rewards of every robot."""
     from baselines.commands.export import export_command
@@ -737,9 +724,7 @@ def train(
     processes: Annotated[
         int, typer.Option(help="Seeds at a time on this machine; 0: one per core.")
     ] = 0,
-    ray: Annotated[
-        str | None, typer.Option(help="Address of an existing Ray cluster to run on instead.")
-    ] = None,
+    ray: Annotated[str | None, RAY] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; default results/train/CONFIG.")
     ] = None,
@@ -785,9 +770,7 @@ def tune(
             help="Processes on this machine; 0: one per core. Results are reproducible with 1 only."
         ),
     ] = 1,
-    ray: Annotated[
-        str | None, typer.Option(help="Address of an existing Ray cluster to run on instead.")
-    ] = None,
+    ray: Annotated[str | None, RAY] = None,
     out: Annotated[
         Path | None, typer.Option(help="Folder of the results; default results/tune/CONFIG.")
     ] = None,
