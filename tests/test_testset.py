@@ -328,10 +328,27 @@ def test_the_published_results_are_those_on_the_page():
     assert found in page
     readme = (DOCS.parent / "README.md").read_text("utf-8")
     held = {entry["policy"].partition("+")[0]: entry["held"]["count"] for entry in board["entries"]}
-    assert f"`kanayama:searched` holds {held['kanayama:searched']} and has the best score" in readme
-    assert f"the default holds {held['reference:linearised']} with" in readme
-    for name in ("adrc:searched", "residual", "reference:tuned", "reference:consistent"):
-        assert f"`{name}` {held[name]}" in readme
-    alone, other = pair["held"]["only"]
-    assert f"{alone} are held by it alone, {other} by the default" in page
+    text = " ".join(readme.split())
+    scores = {
+        entry["policy"].partition("+")[0]: f"{entry['score']['mm']:.1f} mm"
+        for entry in board["entries"]
+    }
+    first = min(board["entries"], key=lambda entry: entry["score"]["mm"])["policy"]
+    assert f"`{first}` has the best score, {scores[first]}, and holds {held[first]};" in text
+    assert f"`from-nothing` has {scores['from-nothing']} and holds {held['from-nothing']}" in text
+    for name in ("kanayama:searched", "adrc:searched"):
+        assert f"`{name}` {scores[name]} and {held[name]}" in text
+    default = "reference:linearised"
+    assert f"the default {scores[default]} and {held[default]}" in text
+    for name in ("reference:tuned", "reference:consistent"):
+        assert f"`{name}` {held[name]}" in text
+    (against,) = (
+        one
+        for one in board["differences"]
+        if (one["policy"], one["other"]) == ("residual", default)
+    )
+    alone, other = against["held"]["only"]
+    assert f"{alone} are held by it alone and {other} by the default alone" in " ".join(
+        page.split()
+    )
     assert (DOCS / "test-set" / "leaderboard.md").read_text("utf-8") == markdown(board)
