@@ -8,7 +8,7 @@ say() { printf '\n== %s\n' "$1"; }
 say "what there is"
 tlf --version
 tlf list tasks | grep -q infinity_from_rest
-tlf run infinit 2>&1 | grep -q "did you mean 'infinity'"
+tlf run infinity_from_rst 2>&1 | grep -q "did you mean 'infinity_from_rest'"
 
 say "the demo"
 tlf demo --out demo
