@@ -39,7 +39,8 @@ def test_a_run_prints_its_table_in_every_encoding(encoding, tmp_path):
     assert done.returncode == 0, done.stderr
     table = done.stdout.decode(encoding)
     assert re.search(r"robot\W+mm\W+mm", table)
-    assert len(re.findall(r"^\W*[012]\W.*ok\W*$", table, re.MULTILINE)) == 3
+    assert len(re.findall(r"^\W*[01]\W.*held\W*$", table, re.MULTILINE)) == 2
+    assert len(re.findall(r"^\W*2\W.*waits\W*$", table, re.MULTILINE)) == 1  # until 10 s
     assert "trajectory.csv" in table
     assert ("–" if encoding in ("utf-8", "cp1252") else "-") in table
     assert "Traceback" not in done.stderr.decode(encoding)

@@ -184,7 +184,7 @@ def test_a_missing_casadi_is_one_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "casadi", None)
     for name in ("nmpc", "nmpc:bounded+ekf-slip+body"):
         with pytest.raises(
-            ValueError, match=r"^nmpc needs casadi \(pip install 'tlf-env\[mpc\]'\)$"
+            ValueError, match=r"^nmpc needs casadi \(.*python -m pip install 'tlf-env\[mpc\]'\)$"
         ):
             fit_policy(name, load_scenario())
 

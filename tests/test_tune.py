@@ -177,7 +177,8 @@ def test_another_search_in_the_same_folder_is_refused(tmp_path, monkeypatch, cha
     StoredStudy(config(), tmp_path)
     with pytest.raises(
         ValueError,
-        match=f"holds a search with a different '{named}' in search.json; choose another --out",
+        match=rf"holds a search with a different '{named}' in search\.json: {named}.* is .* there and .* "
+        "now; choose another --out",
     ):
         run_tune(config(**change), tmp_path)
 
@@ -448,7 +449,9 @@ def test_an_interrupt_is_reported_and_is_not_a_success(tmp_path, monkeypatch, ca
     with pytest.raises(SystemExit) as end:
         main()
     assert end.value.code == 130
-    assert capsys.readouterr().err == "tlf: interrupted\n"
+    line = capsys.readouterr().err
+    assert line.startswith("tlf: interrupted; ")
+    assert line.endswith(f"the same command goes on: tlf tune tuned --out {tmp_path}\n")
 
 
 def test_the_start_is_the_first_trial(tmp_path):

@@ -30,7 +30,16 @@ Four more places outside this package depend on the wheels and have to be adapte
 
 from tlf_env.physics.kernel import roll, slide, substep
 from tlf_env.physics.kinematics import follow_wheels, odometry, wheel_speeds
-from tlf_env.physics.parameters import Body, Mass, RobotParameters, body, body_array, laden
+from tlf_env.physics.parameters import (
+    Body,
+    FrictionCurve,
+    JointFriction,
+    Mass,
+    RobotParameters,
+    body,
+    body_array,
+    laden,
+)
 from tlf_env.physics.state import (
     Contact,
     Floor,
@@ -46,6 +55,8 @@ __all__ = [
     "Body",
     "Contact",
     "Floor",
+    "FrictionCurve",
+    "JointFriction",
     "Mass",
     "Motion",
     "Push",

@@ -26,8 +26,7 @@ from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.spacing import Spacing
 from tlf_env.onboard.supervisor import Neighbour, Supervisor
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
-from tlf_env.physics.parameters import FrictionCurve, JointFriction
-from tlf_env.physics.vehicle import RobotParameters
+from tlf_env.physics.vehicle import FrictionCurve, JointFriction, RobotParameters
 from tlf_env.physics.world import World
 from tlf_env.task.reward import DEFAULT_WEIGHTS, REWARD_MEANINGS
 from tlf_env.task.scenario import PartPath, Scenario
