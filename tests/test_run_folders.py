@@ -13,6 +13,7 @@ import pytest
 from baselines import ReferencePolicy, cli
 from baselines.policies.registry import fit_policy
 from baselines.runs import run as runs
+from baselines.runs.folders import FIGURES, RUN_FILES
 from baselines.runs.run import RECORDED, run_policy
 from baselines.runs.signals import ACTIONS, OBSERVATION, SIGNALS
 from tlf_env import parallel_env
@@ -107,6 +108,23 @@ def test_another_run_is_not_mixed_with_an_earlier_one(monkeypatch, capsys):
     assert not Path("here/trajectory.mat").exists()  # of the run before
     assert Path("here/mine.txt").exists()
     assert json.loads(Path("here/summary.json").read_text(encoding="utf-8"))["seed"] == 1
+
+
+def test_what_a_killed_run_left_behind_does_not_stay(monkeypatch):
+    """It has no summary yet, but may have arrays, tables and figures."""
+    figures = pytest.importorskip("baselines.runs.figures")
+    assert set(FIGURES) == set(figures.FIGURES)
+    Path("here").mkdir()
+    for name in (*RUN_FILES, "mine.png"):
+        Path("here", name).write_text("of a killed run", encoding="utf-8")
+    tlf(monkeypatch, "run", "circle", *SHORT, "--out", "here")
+    assert {path.name for path in Path("here").iterdir()} == {
+        "summary.json",
+        "trajectory.csv",
+        "trajectory.npz",
+        "mine.png",
+    }
+    assert "of a killed run" not in Path("here/trajectory.csv").read_text(encoding="utf-8")
 
 
 @pytest.mark.parametrize("text", ["", "[]", '{"seed": 1}', '{"identity": 3, "files": ["../x"]}'])

@@ -18,12 +18,15 @@ from baselines.console import (
     warn_of_scenarios,
     writable_folder,
 )
+from baselines.policies.learned import shipped_policies
 from baselines.policies.registry import (
     FittedPolicy,
     describe_overrides,
     fit_policy,
     policy_hash,
+    policy_names,
 )
+from baselines.policies.systems import parse_system
 from baselines.runs.files import (
     summary,
     write_mat,
@@ -145,7 +148,8 @@ def identity_for(
 
 def _usual(chosen: Scenario, name: str, seed: int, trust: bool) -> Identity | None:
     """The identity of the run that the names alone describe; None if they do not."""
-    if not is_preset(chosen) or Path(name).suffix:
+    named = name in (*policy_names(), *shipped_policies()) or parse_system(name) is not None
+    if not is_preset(chosen) or not named:
         return None
     usual = load_scenario(chosen.name, disturbance=chosen.disturbance.name)
     return identity_for(name, fit_policy(name, usual, trust=trust), seed, {})

@@ -19,6 +19,12 @@ SUMMARY = "summary.json"
 INDEX = "index.html"
 WRITTEN = "files"  # entry of a summary: the files of its run
 IDENTITY = "identity"  # entry of a summary: what the run depends on
+# Files that any run may have: left behind by one that was killed before its summary.
+FIGURES = ("overview", "paths", "errors", "functionals", "wheels", "slip", "time_gap")
+RUN_FILES = (
+    *(f"trajectory.{kind}" for kind in ("npz", "csv", "mat", "parquet")),
+    *(f"{name}.png" for name in FIGURES),
+)
 NOT_IN_FOLDERS = re.compile(r"[^\w.+-]+")
 LONGEST = 60  # characters of a policy's name in a folder's name
 HASH = 6  # hexadecimal digits in a folder's name
@@ -75,7 +81,7 @@ def is_preset(scenario: Scenario) -> bool:
 def make_room(folder: Path, identity: Identity, overwrite: bool) -> None:
     """Remove the files of an earlier run from a folder: of the same run, or of any with ``overwrite``.
 
-    Other files stay.
+    A run that was killed before its summary does not count. Other files stay.
 
     Raises
     ------
@@ -84,6 +90,8 @@ def make_room(folder: Path, identity: Identity, overwrite: bool) -> None:
     """
     path = folder / SUMMARY
     if not path.exists():
+        for name in RUN_FILES:
+            (folder / name).unlink(missing_ok=True)
         return
     try:
         before = dict(read_json(path))
