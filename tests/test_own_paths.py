@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from baselines import ReferencePolicy, cli
+from baselines.commands import path as path_module
 from baselines.paths.read import read_log
 from baselines.paths.retime import (
     ACCELERATION_MM_S2,
@@ -106,6 +107,19 @@ def test_what_cannot_be_read_is_told_by_its_place(content, options, words, tmp_p
     assert words in said(log_file(tmp_path, content), **options)
 
 
+def test_a_log_that_is_too_long_is_thinned(tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(path_module, "MAX_POINTS", 50)
+    monkeypatch.chdir(tmp_path)
+    noisy(tmp_path, 0.0)
+    tlf(monkeypatch, "path", "log.csv", "--no-figures")
+    assert "Thinned to 50 points" in capsys.readouterr().out
+    points = np.array(load_scenario("path.csv").trajectory.points)
+    assert len(points) == 50
+    assert points[-1, 0] == pytest.approx(T_S[-1])
+    nearest = [np.hypot(*(EIGHT - point).T).min() for point in points[:, 1:]]
+    assert max(nearest) < 20.0
+
+
 def test_a_missing_file_is_named(tmp_path):
     assert "cannot read" in said(tmp_path / "nowhere.csv")
     assert "cannot read" in said(tmp_path)
@@ -178,7 +192,16 @@ def test_a_noisy_log_at_20_hz_is_followed(tmp_path, monkeypatch, capsys):
     assert all(not robot.lost and robot.position_rmse_mm < 5.0 for robot in record.metrics())
 
 
-@pytest.mark.parametrize("words", [["--smooth", "0"], ["--speed-limit", "-1"], ["--units", "ft"]])
+@pytest.mark.parametrize(
+    "words",
+    [
+        ["--smooth", "0"],
+        ["--smooth", "inf"],
+        ["--smooth", "nan"],
+        ["--speed-limit", "-1"],
+        ["--units", "ft"],
+    ],
+)
 def test_values_that_are_not_allowed_are_refused(words, tmp_path, monkeypatch, capsys):
     noisy(tmp_path, 0.0)
     with pytest.raises(SystemExit) as stopped:

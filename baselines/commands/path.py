@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from pathlib import Path
 
@@ -46,8 +47,8 @@ def path_command(
         for a file that cannot be read, and for values that are not positive.
     """
     for option, value in (("smooth", smooth_mm), ("speed-limit", speed_limit_mm_s)):
-        if value is not None and not value > 0:
-            raise ValueError(f"--{option} {value:g} must be above 0")
+        if value is not None and not 0 < value < math.inf:
+            raise ValueError(f"--{option} {value:g} must be above 0 and finite")
     log = read_log(log_file, columns, units)
     for note in log.notes:
         screen.print(f"{log_file.name}: {note}", soft_wrap=True)
@@ -67,6 +68,7 @@ def path_command(
         fewer = np.linspace(times[0], times[-1], MAX_POINTS)
         points = np.stack([np.interp(fewer, times, values) for values in points.T], axis=1)
         times = fewer
+        screen.print(f"Thinned to {MAX_POINTS} points, the most that a path may have")
     writable_folder(out.parent)
     write_path(out, times, points)
     _report(log, out, points, deviation, figures=figures)

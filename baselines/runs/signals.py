@@ -11,7 +11,7 @@ from tlf_env.disturbances.model import wheel_factors
 from tlf_env.engine import readout
 from tlf_env.engine.arrays import Arrays
 from tlf_env.onboard.estimator import Estimate
-from tlf_env.physics.vehicle import Body, Motion
+from tlf_env.physics.vehicle import Body, Motion, odometry
 from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario
@@ -72,9 +72,11 @@ class SignalTape:
         reference = readout.reference(a)
         grip = readout.info_of(a, "tyre_friction_scale")[0]
         left, right, castor = self._patches(motion, body)
-        forward_mm_s = -motion.v_x * np.sin(motion.theta) + motion.v_y * np.cos(motion.theta)
-        turning = body.R * (motion.omega_r - motion.omega_l) / (2.0 * body.h)
-        rolling = body.R * (motion.omega_r + motion.omega_l) / 2.0
+        true = readout.state(a)
+        by_wheels = zip(
+            true.omega_l_rad_s[0], true.omega_r_rad_s[0], body.R[0], body.h[0], strict=True
+        )
+        rolling, turning = np.array([odometry(*one) for one in by_wheels]).T
         acted = a.last_actions[0].T if step else np.full((len(ACTIONS), a.rewards.shape[1]), np.nan)
         lines = [
             *acted,
@@ -82,8 +84,8 @@ class SignalTape:
             *a.terms[0].T,
             reference.u_1[0],
             reference.u_2[0],
-            (forward_mm_s - rolling)[0],
-            (motion.w - turning)[0],
+            true.forward_mm_s[0] - rolling,
+            true.yaw_rad_s[0] - turning,
             *(getattr(estimate, name)[0] for name in Estimate._fields),
             slip.delta_1[0],
             slip.delta_2[0],
