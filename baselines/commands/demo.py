@@ -23,7 +23,7 @@ NEXT = (
     ("tlf run infinity --disturbance ice --policy residual", "the learned policy on ice"),
     ("tlf list", "every task, disturbance, policy and training"),
     ("tlf show infinity > own.yaml; tlf run own.yaml", "a task of your own"),
-    ("tlf train quick", "train a policy in two minutes (needs the extra train)"),
+    ("tlf train quick", "train a policy in a few minutes (needs the extra train)"),
 )
 
 
@@ -31,14 +31,13 @@ class Entry(NamedTuple):
     """A policy of the demo."""
 
     policy: str
-    words: str  # in the table
-    title: str  # above the pictures
+    title: str  # in the table and above the pictures
 
 
 ENTRIES = (
-    Entry("reference:consistent", "the paper's controller and EKF", "the paper's loop"),
-    Entry("reference:linearised", "feedback linearisation, the default", "the default"),
-    Entry("residual", "learned, added to the default", "learned"),
+    Entry("reference:consistent", "the paper's loop"),
+    Entry("reference:linearised", "the default"),
+    Entry("residual", "learned"),
 )
 DISTURBANCES = {"nominal": "no slip", "slip": "slip"}
 
@@ -83,9 +82,9 @@ def demo_table(runs: dict[str, list[Record]], seed: int) -> Table:
         pad_edge=False,
     )
     table.add_column("controller")
-    table.add_column("--policy")
+    table.add_column("--policy", no_wrap=True)
     for words in DISTURBANCES.values():
-        table.add_column(f"error with\n{words}, mm", justify="right")
+        table.add_column(f"{words}:\nerror, mm", justify="right")
         table.add_column("robots\nlost", justify="right")
     for number, entry in enumerate(ENTRIES):
         cells: list[Any] = []
@@ -93,7 +92,7 @@ def demo_table(runs: dict[str, list[Record]], seed: int) -> Table:
             robots = records[number].metrics()
             errors = [one.position_rmse_mm for one in robots if one.position_rmse_mm is not None]
             cells += [f"{max(errors):.1f}", str(sum(one.lost or one.touched for one in robots))]
-        table.add_row(entry.words, entry.policy, *cells)
+        table.add_row(entry.title, entry.policy, *cells)
     return table
 
 
