@@ -79,9 +79,10 @@ def demo_table(runs: dict[str, list[Record]], seed: int) -> Table:
         caption=f"Error: root mean square of the worst robot's distance to its reference, from "
         f"{0.4 * HORIZON_S:g} s on.",
         box=SIMPLE_HEAD,
+        collapse_padding=True,
         pad_edge=False,
     )
-    table.add_column("controller")
+    table.add_column("controller", no_wrap=True)
     table.add_column("--policy", no_wrap=True)
     for words in DISTURBANCES.values():
         table.add_column(f"{words}:\nerror, mm", justify="right")
