@@ -24,7 +24,6 @@ from baselines.console import (
     print_on_any_terminal,
     progress_bar,
     screen,
-    warn_of_compiling,
     warn_of_missing,
     warn_of_scenarios,
     whole_numbers,
@@ -82,10 +81,11 @@ def demo(
     figures: Annotated[bool, typer.Option(help="Draw the picture.")] = True,
 ) -> None:
     """Compare the paper's loop, the default and a learned policy, with and without slip: a first look."""
+    from baselines.commands.compile import compile_before_first_run
     from baselines.commands.demo import demo_command
     from tlf_env.numerics.philox import checked_seed
 
-    warn_of_compiling()
+    compile_before_first_run()
     demo_command(checked_seed(seed), out, figures=figures)
 
 
@@ -387,13 +387,14 @@ def speed(
     out: Annotated[Path | None, typer.Option(help="Write the JSON to this file, too.")] = None,
 ) -> None:
     """Measure steps per second, ours and of mpe2 and VMAS; JSON on stdout, a table on stderr."""
+    from baselines.commands.compile import compile_before_first_run
     from baselines.speed.speed import measure
     from baselines.tables import speed_table
 
     counts = [] if formations == "none" else whole_numbers("formations", formations)
     if out is not None:
         writable_folder(out.parent)
-    warn_of_compiling()
+    compile_before_first_run()
     with progress_bar("speed") as update:
         result = measure(
             steps,
@@ -644,6 +645,7 @@ def bench_test(
     from baselines.benchmark.plan import parse_seeds
     from baselines.benchmark.testset_page import write_test_board
     from baselines.benchmark.testset_plan import PUBLISHED, log_look, plan_of_test
+    from baselines.commands.compile import compile_before_first_run
     from baselines.runs.provenance import command_line
     from baselines.tables import testset_table
 
@@ -651,7 +653,7 @@ def bench_test(
         raise ValueError("--test-seed must not be empty")
     cases = PUBLISHED if seeds is None else parse_seeds(seeds)
     plan = plan_of_test(policies, cases, test_seed or "", trust=trust)
-    warn_of_compiling()
+    compile_before_first_run()
     with progress_bar("test set") as update:
         results = run_bench(
             plan,
@@ -779,6 +781,7 @@ def tune(
     ] = False,
 ) -> None:
     """Search a controller's or a law's numbers. Interrupt it, and call it again to continue."""
+    from baselines.commands.compile import compile_before_first_run
     from baselines.runs.provenance import command_line
     from baselines.tables import tune_table
     from baselines.tuning.config import load_tune
@@ -787,7 +790,7 @@ def tune(
     search = load_tune(config, trials=trials)
     folder = out or Path("results") / "tune" / Path(config).stem
     warn_of_scenarios(search.scenarios(search.ekf_slip).items())
-    warn_of_compiling()
+    compile_before_first_run()
     with progress_bar("tune") as update:
         result = run_tune(
             search,

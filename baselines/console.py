@@ -57,8 +57,8 @@ def print_on_any_terminal() -> None:
 
 
 @contextmanager
-def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
-    """A progress bar on stderr; yields ``update(done, total)``."""
+def progress_bar(what: str) -> Iterator[Callable[..., None]]:
+    """A progress bar on stderr; yields ``update(done, total)``, with a third argument for what is done now."""
     columns = (
         TextColumn("{task.description}", markup=False),
         BarColumn(),
@@ -67,7 +67,9 @@ def progress_bar(what: str) -> Iterator[Callable[[int, int], None]]:
     )
     with Progress(*columns, console=notes, transient=True, disable=not notes.is_terminal) as bar:
         task = bar.add_task(what, total=None)
-        yield lambda done, total: bar.update(task, completed=done, total=total)
+        yield lambda done, total, now=what: bar.update(
+            task, description=now, completed=done, total=total
+        )
 
 
 def warn_of_scenarios(scenarios: Iterable[tuple[str, Scenario]]) -> None:
@@ -76,15 +78,6 @@ def warn_of_scenarios(scenarios: Iterable[tuple[str, Scenario]]) -> None:
 
     for line in warning_lines(scenarios):
         notes.print(f"tlf: warning: {line}", soft_wrap=True)
-
-
-def warn_of_compiling() -> None:
-    """Announce the compilation before the first run on a machine."""
-    from tlf_env.numerics.compiled import cache_folder
-
-    folder = cache_folder()
-    if folder is None or not any(folder.rglob("*control_step*.nbi")):
-        notes.print("Compiling the step drivers, once on this machine: a few minutes.")
 
 
 def warn_of_missing(error: ModuleNotFoundError) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import copy
 import errno
 import functools
+import gc
 import importlib.util
 import os
 import pickle
@@ -429,3 +430,13 @@ def test_nothing_is_cached_where_numba_is_switched_off(monkeypatch):
 
 def abs_of(value: float) -> float:
     return abs(value)
+
+
+def test_compiling_leaves_the_garbage_collector_as_it_was(cache, hits):
+    before = gc.get_threshold()
+    gc.set_threshold(123, 4, 5)
+    try:
+        assert hits() == 0
+        assert gc.get_threshold() == (123, 4, 5)
+    finally:
+        gc.set_threshold(*before)

@@ -9,6 +9,7 @@ import os
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from multiprocessing.connection import Connection
 
 import numpy as np
@@ -91,6 +92,76 @@ def test_after_it_an_episode_finds_everything_in_the_cache():
     ]
 
 
+# Compiles one share, and prints how much work each of its drivers was up to its end.
+WORK = """
+import json, sys
+from numba.core.event import install_listener
+from baselines.commands import compile as command
+
+class Sent(list):
+    send = list.append
+
+sent = Sent()
+with install_listener("numba:compile", command._Counted(sent)):
+    command.compiled(getattr(command, sys.argv[1])[int(sys.argv[2])])
+print(json.dumps([list(one) for one in sent]))
+"""
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["USUAL", "ALL"])
+@pytest.mark.parametrize("which", [0, 1])
+def test_the_progress_bar_ends_where_the_work_ends(name, which, tmp_path):
+    done = subprocess.run(
+        [sys.executable, "-c", WORK, name, str(which)],
+        env={**os.environ, "TLF_ENV_CACHE": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    stages = json.loads(done.stdout)
+    assert [one[1] for one in stages] == sorted(one[1] for one in stages)
+    share = getattr(compile_command, name)[which]
+    assert stages[-1][1] == pytest.approx(share.work, rel=0.1)
+
+
+def work(share: Share, to_parent: Connection) -> None:
+    for done in (0.5, 1.0):
+        to_parent.send(compile_command.Stage(f"driver {share.of[0]}", done * share.work))
+    to_parent.send(share.of[0] == "start")
+
+
+def test_the_progress_bar_names_the_drivers_and_the_share_done(monkeypatch):
+    shown = []
+
+    @contextmanager
+    def bar(what: str):
+        yield lambda done, total, now: shown.append((done / total, now))
+
+    monkeypatch.setattr(compile_command, "compile_share", work)
+    monkeypatch.setattr(compile_command, "progress_bar", bar)
+    assert compile_command.in_two_processes(compile_command.USUAL)
+    parts = [part for part, _ in shown]
+    assert parts == sorted(parts)
+    assert parts[-1] == 1.0
+    assert any("driver step" in now for _, now in shown)
+    assert any("driver start" in now for _, now in shown)
+
+
+def test_a_first_run_compiles_and_the_next_one_does_not(monkeypatch, tmp_path, capsys):
+    compiled = []
+    monkeypatch.setattr(compile_command, "cache_folder", lambda: tmp_path)
+    monkeypatch.setattr(compile_command, "in_two_processes", compiled.append)
+    compile_command.compile_before_first_run()
+    assert compiled == [compile_command.USUAL]
+    assert "once on this machine" in capsys.readouterr().err
+    (tmp_path / "engine").mkdir()
+    (tmp_path / "engine" / "drivers.control_step-1.py311.nbi").touch()
+    compile_command.compile_before_first_run()
+    assert len(compiled) == 1
+    assert not capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("anything", "says"), [(True, "Compiled the step drivers in 0 s"), (False, "All step drivers")]
 )
@@ -169,7 +240,7 @@ def test_an_interrupt_ends_both(monkeypatch, capsys):
 
 
 def test_without_a_folder_nothing_is_compiled(monkeypatch, capsys):
-    monkeypatch.setattr("tlf_env.numerics.compiled.cache_folder", lambda: None)
+    monkeypatch.setattr(compile_command, "cache_folder", lambda: None)
     monkeypatch.setattr(sys, "argv", ["tlf", "compile"])
     with pytest.raises(SystemExit) as ended:
         cli.main()

@@ -14,7 +14,8 @@ from baselines.benchmark.check import (
     digits,
     published_board,
 )
-from baselines.console import notes, progress_bar, screen, warn_of_compiling
+from baselines.commands.compile import compile_before_first_run
+from baselines.console import notes, progress_bar, screen
 
 SHOWN = 5  # differences of an entry that are printed
 
@@ -32,7 +33,7 @@ def check_command(
     board = published_board()
     plan = checked_plan(board, cell, policies)
     folder = out or Path("results/check") / cell.replace(":", "-")
-    warn_of_compiling()
+    compile_before_first_run()
     with progress_bar(f"check {cell}") as update:
         found = check(board, plan, folder, processes=processes, progress=update)
     first, end = plan.seeds

@@ -9,9 +9,12 @@ import time
 from contextlib import suppress
 from multiprocessing import get_context, parent_process
 from multiprocessing.connection import Connection, wait
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
-from baselines.console import notes, screen
+from numba.core.event import Event, Listener, install_listener
+
+from baselines.console import notes, progress_bar, screen
+from tlf_env.numerics.compiled import cache_folder
 
 
 class Share(NamedTuple):
@@ -19,11 +22,14 @@ class Share(NamedTuple):
 
     dtype: str  # of the scenario: each has drivers of its own
     of: tuple[str, ...]  # step, start, speed
+    work: int  # how much that is, for the progress bar: functions, and what their drivers count for
 
 
+# Optimising a driver as a whole takes about half as long as compiling the functions inside it.
+DRIVER_FOR_FUNCTION = 0.5
 # Each for two processes: what most runs need, and everything.
-USUAL = (Share("float32", ("step",)), Share("float32", ("start",)))
-ALL = (Share("float32", ("step", "start", "speed")), Share("float64", ("step", "start")))
+USUAL = (Share("float32", ("step",), 517), Share("float32", ("start",), 180))
+ALL = (Share("float32", ("step", "start", "speed"), 590), Share("float64", ("step", "start"), 579))
 
 
 def compile_drivers(shares: tuple[Share, ...] = USUAL) -> None:
@@ -34,16 +40,13 @@ def compile_drivers(shares: tuple[Share, ...] = USUAL) -> None:
     OSError
         if no folder for compiled code can be written, or a process failed.
     """
-    from tlf_env.numerics.compiled import cache_folder
-
     folder = cache_folder()
     if folder is None:
         raise OSError(
             "no folder for compiled code can be written; the variable TLF_ENV_CACHE names another"
         )
     began = time.perf_counter()
-    with notes.status("Compiling the step drivers"):
-        anything = in_two_processes(shares)
+    anything = in_two_processes(shares)
     took_s = time.perf_counter() - began
     if anything:
         text = f"Compiled the step drivers in {took_s:.0f} s, into {folder}"
@@ -52,8 +55,25 @@ def compile_drivers(shares: tuple[Share, ...] = USUAL) -> None:
     screen.print(text, soft_wrap=True)
 
 
+def compile_before_first_run() -> None:
+    """Compile what most runs need, if this machine has never done so."""
+    folder = cache_folder()
+    if folder is not None and any(folder.rglob("*control_step*.nbi")):
+        return
+    notes.print("Compiling the step drivers, once on this machine: about a minute.")
+    if folder is not None:  # otherwise the run compiles them itself, and nothing is kept
+        in_two_processes(USUAL)
+
+
+class Stage(NamedTuple):
+    """How far a process is."""
+
+    driver: str  # that it works on
+    work: float  # done so far, as in a share
+
+
 def in_two_processes(shares: tuple[Share, ...]) -> bool:
-    """Compile both shares at the same time; whether anything had to be compiled.
+    """Compile both shares at the same time, with a progress bar; whether anything had to be compiled.
 
     However this ends, no process is left behind.
 
@@ -64,7 +84,7 @@ def in_two_processes(shares: tuple[Share, ...]) -> bool:
     """
     context = get_context("spawn")
     processes = []
-    running = {}
+    running: dict[Any, Any] = {}
     try:
         for share in shares:
             answers, to_parent = context.Pipe(duplex=False)
@@ -73,24 +93,44 @@ def in_two_processes(shares: tuple[Share, ...]) -> bool:
             to_parent.close()
             processes.append(process)
             running[answers] = process
+        stages: dict[Any, Stage] = {}
         anything = False
-        while running:
-            ready = wait(list(running))
-            for answers in [one for one in running if one in ready]:
-                process = running.pop(answers)
-                try:
-                    answer = answers.recv()
-                except EOFError:
-                    process.join()
-                    answer = f"a process ended with status {process.exitcode}"
-                if isinstance(answer, str):
-                    raise ChildProcessError(f"the step drivers could not be compiled: {answer}")
-                anything |= answer
+        with progress_bar("Compiling") as update:
+            while running:
+                ready = wait(list(running))
+                for answers in [one for one in running if one in ready]:
+                    answer = received(answers, running[answers])
+                    if isinstance(answer, Stage):
+                        stages[answers] = answer
+                    else:
+                        anything |= answer
+                        del running[answers]
+                now = ", ".join(stages[one].driver for one in running if one in stages)
+                done = round(sum(one.work for one in stages.values()))
+                update(done, max(done, sum(share.work for share in shares)), f"Compiling {now}")
         return anything
     finally:
         for process in processes:
             process.kill()
             process.join()
+
+
+def received(answers: Connection, process: Any) -> Stage | bool:
+    """What a process sent: how far it is, or at its end whether anything had to be compiled.
+
+    Raises
+    ------
+    ChildProcessError
+        if it sent an error, or ended without a word.
+    """
+    try:
+        answer = answers.recv()
+    except EOFError:
+        process.join()
+        answer = f"a process ended with status {process.exitcode}"
+    if isinstance(answer, str):
+        raise ChildProcessError(f"the step drivers could not be compiled: {answer}")
+    return answer
 
 
 def compile_share(share: Share, to_parent: Connection) -> None:
@@ -100,11 +140,38 @@ def compile_share(share: Share, to_parent: Connection) -> None:
     )  # the parent is interrupted, too, and ends this process
     threading.Thread(target=_end_with_parent, daemon=True).start()
     try:
-        answer: bool | str = compiled(share)
+        with install_listener("numba:compile", _Counted(to_parent)):
+            answer: bool | str = compiled(share)
     except Exception as error:
         answer = f"{type(error).__name__}: {error}"
     with suppress(BrokenPipeError):
         to_parent.send(answer)
+
+
+class _Counted(Listener):
+    """Sends the stage of a process whenever Numba has compiled a function."""
+
+    def __init__(self, to_parent: Connection) -> None:
+        self._to_parent = to_parent
+        self._nested: list[
+            str
+        ] = []  # a driver, and the functions inside it, down to the present one
+        self._inside = 0  # functions compiled for this driver
+        self._work = 0.0
+
+    def on_start(self, event: Event) -> None:
+        self._nested.append(event.data["dispatcher"].py_func.__name__)
+
+    def on_end(self, event: Event) -> None:
+        driver = self._nested[0]
+        self._nested.pop()
+        self._inside += 1
+        self._work += 1
+        if not self._nested:
+            self._work += DRIVER_FOR_FUNCTION * self._inside
+            self._inside = 0
+        with suppress(BrokenPipeError):
+            self._to_parent.send(Stage(driver, self._work))
 
 
 def compiled(share: Share) -> bool:

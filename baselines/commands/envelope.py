@@ -23,12 +23,12 @@ from baselines.benchmark.envelope_board import (
 from baselines.benchmark.envelope_runs import LEVELS_FILE, run_envelope
 from baselines.benchmark.page import policy_label
 from baselines.benchmark.plan import parse_seeds
+from baselines.commands.compile import compile_before_first_run
 from baselines.console import (
     given,
     listed,
     progress_bar,
     screen,
-    warn_of_compiling,
     warn_of_missing,
     warn_of_scenarios,
 )
@@ -72,7 +72,7 @@ def bench_envelope(ctx: typer.Context, policies: tuple[str, ...]) -> None:
         (f"{task}, {knob}", plan.ends(task, knob)[0]) for task in plan.tasks for knob in plan.knobs
     )
     folder: Path = options["out"] or OUT
-    warn_of_compiling()
+    compile_before_first_run()
     with progress_bar("envelope") as update:
         results = run_envelope(
             plan,

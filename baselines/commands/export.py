@@ -5,7 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from baselines.benchmark.plan import parse_seeds
-from baselines.console import listed, progress_bar, screen, warn_of_compiling, writable_folder
+from baselines.commands.compile import compile_before_first_run
+from baselines.console import listed, progress_bar, screen, writable_folder
 from baselines.data.episodes import collected, entry_names
 from baselines.data.files import MINARI_FOLDER, About, write_minari, write_parquet
 from baselines.policies.registry import fit_policy
@@ -60,7 +61,7 @@ def export_command(
         scenario=str(scenario),
         versions=versions(),
     )
-    warn_of_compiling()
+    compile_before_first_run()
     episodes = []
     formations = len(fitted) * (end - first)
     with progress_bar("export") as update:

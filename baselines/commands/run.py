@@ -9,11 +9,11 @@ from typing import Any, NamedTuple
 
 import typer
 
+from baselines.commands.compile import compile_before_first_run
 from baselines.console import (
     notes,
     progress_bar,
     screen,
-    warn_of_compiling,
     warn_of_missing,
     warn_of_scenarios,
     writable_folder,
@@ -94,7 +94,7 @@ def run_command(
         folder = RESULTS / folder_name(scenario, identity, _usual(chosen, name, seed, trust))
     writable_folder(folder)
     make_room(folder, identity, wanted.overwrite)
-    warn_of_compiling()
+    compile_before_first_run()
     with progress_bar(f"{scenario.name}, {name}") as update:
         record = run_policy(
             scenario, fitted.policy, seed, name=name, options=options, progress=update

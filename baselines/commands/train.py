@@ -11,11 +11,11 @@ from typing import Any
 
 import typer
 
+from baselines.commands.compile import compile_before_first_run
 from baselines.console import (
     notes,
     progress_bar,
     screen,
-    warn_of_compiling,
     warn_of_scenarios,
     writable_folder,
 )
@@ -51,7 +51,7 @@ def train_command(
     """
     folder = writable_folder(out or Path("results/train") / name)
     warn_of_scenarios(config.named_scenarios())
-    warn_of_compiling()
+    compile_before_first_run()
     rival = default_score(config, folder)
     notes.print(
         f"The default system in the same evaluation: {said(rival)}. Less is better; a failed run counts as "

@@ -13,13 +13,15 @@ sources: an installation may be read-only.
 from __future__ import annotations
 
 import functools
+import gc
 import hashlib
 import os
 import pickle
 import stat
 import tempfile
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -34,8 +36,12 @@ from numba.core.caching import (
     UserProvidedCacheLocator,
 )
 from numba.core.cgutils import create_struct_proxy
+from numba.core.codegen import JITCodeLibrary
+from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
+from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.registry import CPUDispatcher
+from numba.core.typed_passes import NativeLowering
 from numba.extending import intrinsic
 
 from tlf_env.common.errors import shown
@@ -44,6 +50,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 
 PACKAGE = Path(__file__).resolve().parent.parent
 DIGEST_BYTES = hashlib.sha256().digest_size
+FEW = (100_000, 50, 1000)  # thresholds of Python's garbage collector while a driver is compiled
 ROOMS_WITH_LAWS = ("numerics", "physics", "onboard", "disturbances", "task", "engine")
 
 
@@ -245,6 +252,65 @@ class _Cache(FunctionCache):
             _warn_that_nothing_is_kept(cache_folder())
 
 
+class _LinkedLibrary(JITCodeLibrary):
+    """Code of a function that is only linked into its callers.
+
+    Numba optimises every function and makes machine code of it, also where nothing but compiled code calls
+    it. Here both are done once, for the driver that all its functions are linked into.
+    """
+
+    def _optimize_final_module(self) -> None:
+        """Nothing: the driver is optimised as a whole."""
+
+    def _finalize_final_module(self) -> None:
+        self._finalize_dynamic_globals()
+        self._verify_declare_only_symbols()
+        self._finalized = True
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _LinkedLowering(NativeLowering):
+    _name = "linked_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _LinkedLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.flags.no_compile = True
+        super().run_pass(state)
+        key = object()  # Numba knows a function by what Python would call; here there is nothing
+        state.targetctx.insert_user_function(key, state.cr.fndesc, [state.library])
+        state["cr"] = state.cr._replace(cfunc=key)
+        return True
+
+
+class _LinkedCompiler(CompilerBase):
+    def define_pipelines(self) -> list[PassManager]:
+        manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
+        manager.passes = [
+            (_LinkedLowering if one is NativeLowering else one, what)
+            for one, what in manager.passes
+        ]
+        manager.finalize()
+        return [manager]
+
+
+@contextmanager
+def _few_collections() -> Iterator[None]:
+    """Look less often for garbage: Numba holds millions of objects, and next to none is garbage."""
+    with global_compiler_lock:  # so that no other thread restores what is set here
+        before = gc.get_threshold()
+        gc.set_threshold(*FEW)
+        try:
+            yield
+        finally:
+            gc.set_threshold(*before)
+
+
+class _Driver(CPUDispatcher):
+    def compile(self, sig: Any) -> Any:
+        with _few_collections():
+            return super().compile(sig)
+
+
 class _Inner(CPUDispatcher):
     """A function for compiled code. For Python it is compiled a second time, when Python first calls it.
 
@@ -268,7 +334,11 @@ def _inner(function: F, **options: bool) -> F:
         return function
     common = {"nopython": True, "nogil": True, "error_model": "numpy"}
     without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    dispatcher: F = _Inner(function, targetoptions={**common, **without, **options})
+    dispatcher: F = _Inner(
+        function,
+        targetoptions={**common, **without, **options},
+        pipeline_class=_LinkedCompiler,
+    )
     return dispatcher
 
 
@@ -305,9 +375,11 @@ def allocating(function: F) -> F:
 
 def driver(function: F) -> F:
     """Compile a function over arrays, and keep the result on disk."""
-    dispatcher: Any = numba.njit(error_model="numpy", nogil=True, no_cfunc_wrapper=True)(function)
-    if dispatcher is not function:  # as it is where Numba is switched off
-        dispatcher._cache = _NothingKept() if cache_folder() is None else _Cache(function)
+    if numba.config.DISABLE_JIT:
+        return function
+    options = {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
+    dispatcher: Any = _Driver(function, targetoptions=options)
+    dispatcher._cache = _NothingKept() if cache_folder() is None else _Cache(function)
     compiled: F = dispatcher
     return compiled
 
