@@ -17,6 +17,7 @@ from typing import Annotated, Any
 import typer
 from typer.exceptions import TyperException
 
+from baselines.commands.examples import examples
 from baselines.console import (
     given,
     listed,
@@ -72,7 +73,7 @@ def everywhere(
     """Time-gap leader-follower formations of wheeled robots that slip."""
 
 
-@app.command()
+@app.command(epilog=examples("demo"))
 def demo(
     seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     out: Annotated[Path, typer.Option(help="Folder of the picture and the data.")] = Path(
@@ -89,7 +90,7 @@ def demo(
     demo_command(checked_seed(seed), out, figures=figures)
 
 
-@app.command("list")
+@app.command("list", epilog=examples("list"))
 def list_(
     kind: Annotated[
         str | None,
@@ -131,7 +132,7 @@ TRUST = typer.Option(
 )
 
 
-@app.command()
+@app.command(epilog=examples("show"))
 def show(
     scenario: Annotated[str, SCENARIO],
     disturbance: Annotated[str | None, DISTURBANCE] = None,
@@ -148,7 +149,7 @@ def show(
     typer.echo(str(chosen) if changes else shown_scenario(chosen), nl=False)
 
 
-@app.command()
+@app.command(epilog=examples("run"))
 def run(
     scenario: Annotated[str, SCENARIO],
     disturbance: Annotated[str | None, DISTURBANCE] = None,
@@ -255,7 +256,7 @@ def run(
         raise SystemExit(INTERRUPTED)
 
 
-@app.command("path")
+@app.command("path", epilog=examples("path"))
 def path_(
     log: Annotated[
         Path,
@@ -337,7 +338,7 @@ def named_policy(policy: str, gains: str | None) -> str:
     return policy
 
 
-@app.command()
+@app.command(epilog=examples("openloop"))
 def openloop(
     scenarios: Annotated[Path, typer.Argument(help="JSON file of named scenarios.")],
     out: Annotated[Path, typer.Option(help="Folder for one NAME.csv per scenario.")] = Path(
@@ -370,7 +371,7 @@ def openloop(
             screen.print(path, soft_wrap=True)
 
 
-@app.command()
+@app.command(epilog=examples("speed"))
 def speed(
     steps: Annotated[int, typer.Option(help="Environment steps per timing.")] = 1000,
     repeats: Annotated[
@@ -432,7 +433,7 @@ def take_plan(ctx: typer.Context, plan: str | None) -> str | None:
     return plan
 
 
-@app.command()
+@app.command(epilog=examples("bench"))
 def bench(
     ctx: typer.Context,
     policies: Annotated[
@@ -671,7 +672,7 @@ def bench_test(
     screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
 
 
-@app.command()
+@app.command(epilog=examples("export"))
 def export(
     tasks: Annotated[str, typer.Argument(help="Tasks, comma-separated (see `tlf list tasks`).")],
     policy: Annotated[
@@ -710,7 +711,7 @@ def export(
     )
 
 
-@app.command()
+@app.command(epilog=examples("train"))
 def train(
     config: Annotated[
         str,
@@ -754,7 +755,7 @@ def train(
     )
 
 
-@app.command()
+@app.command(epilog=examples("tune"))
 def tune(
     config: Annotated[
         str,
@@ -810,7 +811,7 @@ def tune(
     screen.print(f"tlf run {search.tasks[0]} {how}", soft_wrap=True)
 
 
-@app.command("compile")
+@app.command("compile", epilog=examples("compile"))
 def compile_(
     everything: Annotated[
         bool,

@@ -4,14 +4,18 @@ from __future__ import annotations
 
 import io
 import json
+import shlex
+import sys
 
 import gymnasium
 import pettingzoo
 import pytest
+import typer
 
 import tlf_env
 from baselines import cli
 from baselines.commands import catalogue, scenarios
+from baselines.commands.examples import EXAMPLES
 from baselines.policies.learned import shipped_policies
 from baselines.policies.systems import ESTIMATORS
 from tlf_env.common.presets import KINDS, parsed_yaml, preset_names
@@ -235,3 +239,29 @@ def test_every_task_has_an_id_of_both_libraries():
     if hasattr(pettingzoo, "register"):
         env = pettingzoo.make("parallel", "tlf_env/long_circle-v0")
         assert env.scenario.name == "long_circle"
+
+
+EXAMPLE_LINES = [line for lines in EXAMPLES.values() for line in lines]
+
+
+def test_every_command_has_examples():
+    assert set(EXAMPLES) == set(typer.main.get_command(cli.app).commands)
+
+
+@pytest.mark.parametrize("line", EXAMPLE_LINES)
+def test_every_example_can_be_called(line):
+    for part in line.split("|"):
+        words = shlex.split(part.partition(">")[0])
+        assert words[0] == "tlf"
+        command = typer.main.get_command(cli.app).commands[words[1]]
+        command.make_context(words[1], words[2:])
+
+
+@pytest.mark.parametrize("name", sorted(EXAMPLES))
+def test_the_help_ends_with_the_examples(name, monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", ["tlf", name, "--help"])
+    cli.main()
+    end = capsys.readouterr().out.partition("Examples:\n")[2]
+    for line, what in EXAMPLES[name].items():
+        assert f"  {line}\n" in end
+        assert what in end

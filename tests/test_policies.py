@@ -372,14 +372,22 @@ def test_a_run_warns_of_the_scenario_that_the_policy_asks_for(monkeypatch, capsy
 def test_a_run_notes_the_start_at_speed_once_and_beside_the_result(
     as_json, monkeypatch, capsys, tmp_path
 ):
-    words = ["infinity", "--no-figures", "--horizon-s", "0.2", "--out", str(tmp_path), *as_json]
-    monkeypatch.setattr(sys, "argv", ["tlf", "run", *words])
+    (tmp_path / "fast.yaml").write_text("base: infinity\nname: fast\n")
+    words = [str(tmp_path / "fast.yaml"), "--no-figures", "--horizon-s", "0.2", *as_json]
+    monkeypatch.setattr(sys, "argv", ["tlf", "run", *words, "--out", str(tmp_path / "out")])
     main()
     shown = capsys.readouterr()
     assert shown.err.count("tlf: note: the reference starts at 559 mm/s") == 1
     assert "559 mm/s" not in shown.out
     if as_json:
         json.loads(shown.out)
+
+
+def test_a_run_of_a_preset_does_not_note_its_start(monkeypatch, capsys, tmp_path):
+    words = ["infinity", "--no-figures", "--horizon-s", "0.2", "--out", str(tmp_path)]
+    monkeypatch.setattr(sys, "argv", ["tlf", "run", *words])
+    main()
+    assert "note" not in capsys.readouterr().err
 
 
 def test_a_zip_is_loaded_only_on_trust(tmp_path):

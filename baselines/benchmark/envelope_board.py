@@ -234,7 +234,7 @@ def envelope_page(board: Mapping[str, Any], figures: Sequence[str] = ()) -> str:
         [
             "# Envelopes\n",
             f"Made by `{board['command']}`.\n",
-            f"{explanation(board)} Definitions: `docs/envelopes.md`.\n",
+            f"{explanation(board)}\n",
             *envelope_tables(board),
             "",
             f"{board['levels']} levels of up to {end - first} runs took "

@@ -14,6 +14,23 @@ MOST_LATE = 0.01  # share of late steps of an entry in real time
 # How `comparisons` are made; a leaderboard.json without the key `compared_by` has the second.
 PAIRED, OF_MEDIANS = "Medians of the differences", "Differences of medians"
 
+# In full in docs/benchmark.md and docs/metrics.md, which are not beside a user's results.
+DEFINITIONS = (
+    "## Definitions\n",
+    "- Position RMS: root mean square of a robot's distance to its own reference, after the first 40 % of "
+    "the run. Formation RMS: of its distance to the leader's path, one time gap later for each robot. "
+    "Both of the worst robot of a run; median over seeds.",
+    "- Capped mean: mean of the first distance over the whole run, counted as at most 500 mm, so that it "
+    "is finite for a lost run.",
+    "- Lost: the distance exceeded `lost_beyond_mm`, or was above 100 mm (RMS) in the last 30 % of the run.",
+    "- Score of a robot: 100 times the mean over time of 1/(1 + formation error/10 mm), which counts as 0 "
+    "once the robot is lost or has touched something. 100 is perfect; a constant error of 10 mm gives 50. "
+    "The score of a run is the mean over its robots.",
+    "- IQM: the mean of the middle half of the runs. Normalised: the IQM divided by that of the reference. "
+    "Better than the reference: probability that a run scores higher than one of the reference; ties count "
+    "half.\n",
+)
+
 
 def markdown(board: dict[str, Any], figures: Sequence[str] = ()) -> str:
     """The tables as Markdown, with links to the figures."""
@@ -23,7 +40,7 @@ def markdown(board: dict[str, Any], figures: Sequence[str] = ()) -> str:
         "# Leaderboard\n",
         f"Made by `{board['command']}`: seeds {first} to {end - 1}, the same draws for every policy. "
         "Intervals are 95 %, by stratified bootstrap (shares: Wilson). A run fails if a robot is lost or "
-        "touches another. Definitions: `docs/metrics.md`, `docs/benchmark.md`.\n",
+        "touches another.\n",
         "## Over all tasks and disturbances\n",
         "| policy | score (IQM) | interval | normalised | better than the reference | failed |",
         "|---|---:|---:|---:|---:|---:|",
@@ -56,6 +73,7 @@ def markdown(board: dict[str, Any], figures: Sequence[str] = ()) -> str:
     if figures:
         parts.append("## Figures\n")
         parts += [f"![{figure_title(name)}]({name})\n" for name in figures]
+    parts += DEFINITIONS
     return "\n".join(parts)
 
 

@@ -34,8 +34,7 @@ def markdown(board: dict[str, Any]) -> str:
     parts = [
         "# Test set\n",
         f"Made by `{board['command']}`: test set version {board['version']}, {which}, {first} to {end - 1}. "
-        "This version is frozen. Intervals are 95 % (shares: Wilson; the others: bootstrap over cases). "
-        "Definitions: `docs/test-set.md`.\n",
+        "This version is frozen. Intervals are 95 % (shares: Wilson; the others: bootstrap over cases).\n",
         "## Score\n",
         "Geometric mean over the cases of the formation RMS of the worst robot, "
         f"{LEAST_MM:g} to {CAP_MM:g} mm, with {CAP_MM:g} mm for a failed run: less is better. The last four "

@@ -44,6 +44,7 @@ from baselines.runs.folders import (
 )
 from baselines.runs.run import Record, run_policy
 from baselines.tables import metrics_table
+from tlf_env.common.presets import preset_names
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.task.scenario import Scenario, load_scenario, scenario_notes
 from tlf_env.task.start import start_options
@@ -86,8 +87,9 @@ def run_command(
         notes.print(f"tlf: note: {name} asks for {fields}", soft_wrap=True)
     scenario = fitted.scenario
     warn_of_scenarios([(scenario.name, scenario)])
-    for line in scenario_notes(scenario):
-        notes.print(f"tlf: note: {line}", soft_wrap=True)
+    if not _shipped_path(chosen):  # the paper's own trajectories start at speed, too
+        for line in scenario_notes(scenario):
+            notes.print(f"tlf: note: {line}", soft_wrap=True)
     identity = identity_for(name, fitted, seed, options)
     folder = wanted.out
     if folder is None:
@@ -144,6 +146,13 @@ def identity_for(
     """The identity of a run with a policy of this name."""
     digits = policy_hash(name, fitted.policy)
     return identity_of(fitted.scenario, name, digits, seed, options)
+
+
+def _shipped_path(chosen: Scenario) -> bool:
+    """Whether the leader's path is that of the preset of the same name."""
+    return (
+        chosen.name in preset_names() and chosen.trajectory == load_scenario(chosen.name).trajectory
+    )
 
 
 def _usual(chosen: Scenario, name: str, seed: int, trust: bool) -> Identity | None:

@@ -1,0 +1,61 @@
+"""Examples of each command, for its ``--help``."""
+
+from __future__ import annotations
+
+EXAMPLES: dict[str, dict[str, str]] = {
+    "demo": {
+        "tlf demo": "seed 0, into results/demo",
+        "tlf demo --seed 3 --out results/seed-3": "other draws of noise and slip",
+    },
+    "list": {
+        "tlf list": "everything that has a name",
+        "tlf list disturbances": "the presets, with a line on each",
+        "tlf list tasks --json": "names for a program",
+    },
+    "show": {
+        "tlf show infinity > own.yaml": "a file to start from",
+        "tlf show infinity --disturbance ice --changes": "only what is not a default",
+        "tlf show flower --set time_gap_s=3 | tlf run -": "change a field and run",
+    },
+    "run": {
+        "tlf run infinity": "the default controller, without disturbance",
+        "tlf run flower --disturbance slip --policy residual": "a learned policy on slip",
+        "tlf run infinity --set time_gap_s=3 --seed 7": "any field of the scenario",
+        "tlf run own.yaml --policy my_module:make": "a task and a policy of your own",
+    },
+    "path": {
+        "tlf path log.csv --units m --smooth 5": "a noisy log in metres",
+        "tlf path log.csv --columns time,px,py --speed-limit 400": "columns by name, at most 400 mm/s",
+    },
+    "openloop": {"tlf openloop scenarios.json --out results/openloop": "one CSV for each scenario"},
+    "speed": {
+        "tlf speed": "ours alone and many at once, and the peers that are installed",
+        "tlf speed --formations 1024 --steps 200": "one size, shorter",
+    },
+    "bench": {
+        "tlf bench --policies reference,residual --tasks infinity --disturbances slip,ice --seeds 0:10": "a "
+        "small comparison",
+        "tlf bench --policies my.zip --trust --tasks infinity,flower": "a policy of SB3, 50 seeds",
+        "tlf bench --check infinity:slip": "a cell of the published board again, digit for digit",
+        "tlf bench --plan board --out results/board": "the whole board, about two hours of a core",
+    },
+    "export": {
+        "tlf export infinity --policy reference --seeds 0:20 --out data": "20 runs as an offline data set",
+    },
+    "train": {
+        "tlf train quick": "a few minutes, into results/train/quick",
+        "tlf train residual --seeds 1": "a shipped policy again, from another seed",
+        "tlf train own.yaml --robot-steps 200000": "a training of your own, shorter",
+    },
+    "tune": {"tlf tune adrc --trials 50": "a search of the gains; call it again to continue"},
+    "compile": {
+        "tlf compile": "what most runs need",
+        "tlf compile --all": "also for tlf speed and double precision",
+    },
+}
+
+
+def examples(command: str) -> str:
+    """The end of a command's help: its examples in lines of their own."""
+    lines = [f"  {line}\n      {what}" for line, what in EXAMPLES[command].items()]
+    return "\b\nExamples:\n" + "\n".join(lines)
