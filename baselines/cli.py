@@ -256,6 +256,22 @@ def run(
         raise SystemExit(INTERRUPTED)
 
 
+@app.command(epilog=examples("compare"))
+def compare(
+    folders: Annotated[
+        list[Path], typer.Argument(help="Folders of runs of one task and seed, by `tlf run`.")
+    ],
+    out: Annotated[Path, typer.Option(help="The page that is written.")] = Path(
+        "results/compare.html"
+    ),
+) -> None:
+    """Show recorded runs side by side: one page with one time line, and what differs."""
+    from baselines.commands.compare import compare_command
+
+    writable_folder(out.parent)
+    compare_command(folders, out)
+
+
 @app.command("path", epilog=examples("path"))
 def path_(
     log: Annotated[

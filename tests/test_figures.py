@@ -19,10 +19,12 @@ from matplotlib.patches import Circle, Polygon
 
 from baselines import ReferencePolicy
 from baselines.runs import figures
-from baselines.runs.panels import MOST_POINTS, MOST_SHOWN, robot_colour, thinned, title
-from baselines.runs.plane import body_polygons, snapshot_rows
+from baselines.runs.bodies import body_polygons
+from baselines.runs.borders import moving_borders, pushed_borders
+from baselines.runs.panels import MOST_POINTS, MOST_SHOWN, robot_colour, thinned
+from baselines.runs.plane import snapshot_rows
 from baselines.runs.run import Record, run_policy
-from baselines.runs.world import colour, moving_borders, pushed_borders, world_handles
+from baselines.runs.world import colour, world_handles
 from tlf_env import load_scenario
 from tlf_env.rendering.looks import CRATE, MOVER, SLIPPERY, WALL
 
@@ -391,9 +393,9 @@ def test_the_settle_time_is_marked() -> None:
 
 def test_the_title_names_task_policy_disturbance_and_seed() -> None:
     run = record("1")
-    assert title(run) == "flower, policy test, disturbance nominal, seed 0"
+    assert run.title == "flower, policy test, disturbance nominal, seed 0"
     half = load_scenario(run.scenario, disturbance_level=0.5)
-    assert "nominal × 0.5" in title(replace(run, scenario=half))
+    assert "nominal × 0.5" in replace(run, scenario=half).title
 
 
 @pytest.mark.parametrize("count", [1, 10, 4000, 4001, 99_999])

@@ -55,6 +55,7 @@ def test_presets_alone_give_a_folder_without_digits(monkeypatch):
         "summary.json",
         "trajectory.csv",
         "trajectory.npz",
+        "replay.html",
     }
 
 
@@ -75,7 +76,7 @@ def test_every_different_run_has_a_folder_of_its_own(monkeypatch):
     assert len(names) == len(variants)
     assert any(name.startswith("circle-kanayama_searched+ekf-gyro") for name in names)
     page = Path("results/index.html").read_text(encoding="utf-8")
-    assert all(f'href="{name}/"' in page for name in names)
+    assert all(f'href="{name}/replay.html"' in page for name in names)
     tlf(monkeypatch, "run", "circle", *SHORT)  # again: in its place
     assert folders() == names
 
@@ -122,6 +123,7 @@ def test_what_a_killed_run_left_behind_does_not_stay(monkeypatch):
         "summary.json",
         "trajectory.csv",
         "trajectory.npz",
+        "replay.html",
         "mine.png",
     }
     assert "of a killed run" not in Path("here/trajectory.csv").read_text(encoding="utf-8")

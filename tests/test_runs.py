@@ -223,4 +223,7 @@ def test_without_things_that_move_a_record_is_as_before(tmp_path):
             "leader_reference_mm",
             *record.columns,
             *record.signals,
+            "lost_at_s",
+            "touched_at_s",
+            "touched_by",
         }

@@ -10,8 +10,9 @@ from rich.table import Table
 
 from baselines.commands.run import Wanted, identity_for, write_run
 from baselines.console import progress_bar, screen, warn_of_missing, writable_folder
+from baselines.pages.replay import write_comparison
 from baselines.policies.registry import fit_policy
-from baselines.runs.folders import make_room
+from baselines.runs.folders import REPLAY, make_room
 from baselines.runs.run import Record, run_policy
 from tlf_env.task.scenario import load_scenario
 
@@ -63,9 +64,11 @@ def demo_command(seed: int, out: Path, *, figures: bool) -> dict[str, list[Recor
                 write_run(record, folder, identity, wanted)
                 runs[disturbance].append(record)
                 update(sum(map(len, runs.values())), total)
+    replay = write_comparison(runs["slip"], out / REPLAY, [entry.title for entry in ENTRIES])
     screen.print(demo_table(runs, seed))
     if figures:
         draw(runs, seed, out)
+    screen.print(f"Replay of the runs with slip, in a browser: {replay}", soft_wrap=True)
     screen.print("Next:")
     for command, words in NEXT:
         screen.print(f"  {command:<55}{words}", soft_wrap=True)

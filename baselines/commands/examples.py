@@ -23,6 +23,10 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "tlf run infinity --set time_gap_s=3 --seed 7": "any field of the scenario",
         "tlf run own.yaml --policy my_module:make": "a task and a policy of your own",
     },
+    "compare": {
+        "tlf compare results/infinity-consistent-slip-0 results/infinity-residual-slip-0": "two runs of "
+        "one task and seed",
+    },
     "path": {
         "tlf path log.csv --units m --smooth 5": "a noisy log in metres",
         "tlf path log.csv --columns time,px,py --speed-limit 400": "columns by name, at most 400 mm/s",

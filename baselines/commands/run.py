@@ -18,6 +18,8 @@ from baselines.console import (
     warn_of_scenarios,
     writable_folder,
 )
+from baselines.pages.replay import write_replay
+from baselines.pages.runs import write_index
 from baselines.policies.learned import shipped_policies
 from baselines.policies.registry import (
     FittedPolicy,
@@ -35,12 +37,12 @@ from baselines.runs.files import (
     write_summary,
 )
 from baselines.runs.folders import (
+    REPLAY,
     Identity,
     folder_name,
     identity_of,
     is_preset,
     make_room,
-    write_index,
 )
 from baselines.runs.run import Record, run_policy
 from baselines.tables import metrics_table
@@ -125,6 +127,7 @@ def write_run(record: Record, folder: Path, identity: Identity, wanted: Wanted) 
         written.append(write_mat(record, folder))
     if wanted.parquet:
         written.append(write_parquet(record, folder))
+    written.append(write_replay(record, folder / REPLAY))
     if wanted.figures:
         written += draw(record, folder)
     return [write_summary(record, folder, identity, written), *written]

@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
 from baselines.runs.folders import IDENTITY, SUMMARY, WRITTEN, Identity
 from baselines.runs.provenance import versions
-from baselines.runs.run import Record
+from baselines.runs.run import RECORDED, Record
 from baselines.runs.signals import OBSERVATION
 from tlf_env.common.errors import install_command
-from tlf_env.common.files import atomic
+from tlf_env.common.files import atomic, read_json
+from tlf_env.task.scenario import Scenario
+
+TRAJECTORY = "trajectory.npz"
+ENDS = ("lost_at_s", "touched_at_s", "touched_by")  # arrays of a record, (robot,)
 
 
 def summary(record: Record) -> dict[str, Any]:
@@ -38,13 +43,15 @@ def arrays(record: Record) -> dict[str, np.ndarray]:
 
     ``t_s`` (time,), ``leader_reference_mm`` (time, 2), and each column (time, robot). If the world has things
     to push or moving obstacles, also ``objects`` (time, object, 3): their x and y (mm) and angle (rad), the
-    pushables first, each kind in the order of the scenario.
+    pushables first, each kind in the order of the scenario. ``lost_at_s``, ``touched_at_s`` (infinite if
+    never) and ``touched_by``, a :class:`~tlf_env.TouchedBy`, are ``(robot,)``.
     """
     out = {
         "t_s": record.t_s,
         "leader_reference_mm": record.leader,
         **record.columns,
         **record.signals,
+        **{name: getattr(record, name) for name in ENDS},
     }
     return out if record.objects is None else {**out, "objects": record.objects}
 
@@ -74,7 +81,7 @@ def write_record(record: Record, folder: Path) -> list[Path]:
 
     The CSV file has a row for each time and robot, and all columns but the observations.
     """
-    paths = [folder / name for name in ("trajectory.npz", "trajectory.csv")]
+    paths = [folder / name for name in (TRAJECTORY, "trajectory.csv")]
     with atomic(paths[0], "wb") as file:
         columns: dict[str, Any] = arrays(record)
         np.savez_compressed(file, **columns)
@@ -84,6 +91,56 @@ def write_record(record: Record, folder: Path) -> list[Path]:
         formats = ["%.6g", "%d", *["%.9g"] * (len(rows) - 2)]
         np.savetxt(file, np.column_stack(list(rows.values())), fmt=formats, delimiter=",")
     return paths
+
+
+def read_record(folder: Path) -> Record:
+    """The record of a finished run, from the files of its folder.
+
+    Raises
+    ------
+    ValueError
+        naming folder or file, if it is no folder of a run, or a file is broken or of an earlier version.
+    """
+    about = folder / SUMMARY
+    if not about.is_file():
+        raise ValueError(f"{folder} holds no run: there is no {SUMMARY} in it")
+    told = read_json(about)
+    path = folder / TRAJECTORY
+    try:
+        scenario = Scenario.model_validate(told["scenario"])
+        with np.load(path, allow_pickle=False) as file:
+            found = {name: file[name] for name in file.files}
+        ends = {name: found.pop(name) for name in ENDS}
+        record = Record(
+            scenario=scenario,
+            seed=int(told["seed"]),
+            policy=str(told["policy"]),
+            t_s=found.pop("t_s"),
+            leader=found.pop("leader_reference_mm"),
+            objects=found.pop("objects", None),
+            columns={name: found.pop(name) for name in RECORDED},
+            signals=found,
+            options=told["reset_options"],
+            interrupted=bool(told["interrupted"]),
+            **ends,
+        )
+    except FileNotFoundError:
+        raise ValueError(f"{folder} holds no run: there is no {TRAJECTORY} in it") from None
+    except (KeyError, TypeError) as error:
+        raise ValueError(
+            f"{folder}: {error} is missing or wrong; run it again with this version"
+        ) from None
+    except (OSError, ValueError, BadZipFile) as error:
+        raise ValueError(f"{folder}: a file of the run is broken: {error}") from None
+    shape = (len(record.t_s), record.robots)
+    wrong = [
+        name for name, one in (record.columns | dict(record.signals)).items() if one.shape != shape
+    ]
+    if wrong or len(scenario.robot_models) != record.robots:
+        raise ValueError(
+            f"{path}: {', '.join(wrong) or 'robots'}: not {shape[0]} times and {shape[1]} robots"
+        )
+    return record
 
 
 def write_summary(record: Record, folder: Path, identity: Identity, written: list[Path]) -> Path:

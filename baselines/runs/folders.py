@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import hashlib
-import html
 import json
 import re
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tlf_env.common.files import atomic, read_json
+from tlf_env.common.files import read_json
 from tlf_env.common.presets import preset_names
 from tlf_env.task.neutral import scenario_hash
 from tlf_env.task.scenario import Scenario
 
 SUMMARY = "summary.json"
 INDEX = "index.html"
+REPLAY = "replay.html"
 WRITTEN = "files"  # entry of a summary: the files of its run
 IDENTITY = "identity"  # entry of a summary: what the run depends on
 # Files that any run may have: left behind by one that was killed before its summary.
@@ -24,6 +24,7 @@ FIGURES = ("overview", "paths", "errors", "functionals", "wheels", "slip", "time
 RUN_FILES = (
     *(f"trajectory.{kind}" for kind in ("npz", "csv", "mat", "parquet")),
     *(f"{name}.png" for name in FIGURES),
+    REPLAY,
 )
 NOT_IN_FOLDERS = re.compile(r"[^\w.+-]+")
 LONGEST = 60  # characters of a policy's name in a folder's name
@@ -120,73 +121,6 @@ def _difference(held: Any, identity: Identity) -> str:
     ]
     old = Identity(*held)
     return f"{old.policy}, seed {old.seed}; different: {', '.join(names)}"
-
-
-# --- the page that lists runs
-
-HEADINGS = ("run", "task", "policy", "disturbance", "seed", "worst position RMS, mm", "verdict")
-PAGE = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><title>Runs</title>
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<style>
-:root {{ color-scheme: light dark; }}
-body {{ font-family: system-ui, sans-serif; margin: 2rem auto; max-width: 75rem; padding: 0 1rem; }}
-table {{ border-collapse: collapse; width: 100%; }}
-th, td {{ text-align: left; padding: 0.35rem 0.7rem; border-bottom: 1px solid #8884; }}
-td.number {{ text-align: right; font-variant-numeric: tabular-nums; }}
-img {{ height: 5rem; }}
-</style></head><body>
-<h1>Runs in this folder</h1>
-<p>Made by <code>tlf run</code>; the latest is first. Errors: the largest root mean square among the robots.</p>
-<table><thead><tr>{headings}<th>overview</th></tr></thead><tbody>
-{rows}
-</tbody></table></body></html>
-"""
-
-
-def write_index(parent: Path) -> Path | None:
-    """Write a page with a row for each run in the folders of ``parent``; None if there is no run."""
-    summaries = sorted(parent.glob(f"*/{SUMMARY}"), key=lambda path: -path.stat().st_mtime)
-    rows = [row for path in summaries if (row := _row(path)) is not None]
-    if not rows:
-        return None
-    page = parent / INDEX
-    headings = "".join(f"<th>{heading}</th>" for heading in HEADINGS)
-    with atomic(page, encoding="utf-8") as file:
-        file.write(PAGE.format(headings=headings, rows="\n".join(rows)))
-    return page
-
-
-def _row(path: Path) -> str | None:
-    """A row of the page; None for a summary that cannot be read."""
-    try:
-        data = read_json(path)
-        robots = list(data["robots"].values())
-        errors = [robot["position_rmse_mm"] for robot in robots]
-        scenario = data["scenario"]
-        cells = [
-            scenario["name"],
-            data["policy"],
-            scenario["disturbance"]["name"],
-            str(data["seed"]),
-            "–" if None in errors else f"{max(errors):.2f}",
-            verdict(data.get("interrupted", False), robots),
-        ]
-    except (ValueError, TypeError, KeyError, AttributeError):
-        return None
-    name = html.escape(path.parent.name)
-    picture = path.parent / "overview.png"
-    image = f'<img src="{name}/{picture.name}" alt="overview">' if picture.exists() else ""
-    texts = "".join(
-        f'<td class="number">{html.escape(cell)}</td>'
-        if number in (3, 4)
-        else f"<td>{html.escape(cell)}</td>"
-        for number, cell in enumerate(cells)
-    )
-    return (
-        f'<tr><td><a href="{name}/">{name}</a></td>{texts}'
-        f'<td><a href="{name}/{picture.name}">{image}</a></td></tr>'
-    )
 
 
 def verdict(interrupted: bool, robots: Iterable[Mapping[str, Any]]) -> str:

@@ -26,16 +26,6 @@ MOST_SHOWN = 24  # rows of robots, and entries of a legend
 NOTE: dict[str, Any] = {"textcoords": "offset points", "color": GREY, "fontsize": "small"}
 
 
-def title(record: Record) -> str:
-    """Task, policy, disturbance and seed of a run."""
-    disturbance = record.scenario.disturbance
-    level = "" if disturbance.level == 1 else f" × {disturbance.level:g}"
-    return (
-        f"{record.scenario.name}, policy {record.policy}, disturbance {disturbance.name}{level}, "
-        f"seed {record.seed}"
-    )
-
-
 def thinned(t_s: np.ndarray, values: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """At most about ``MOST_POINTS`` points of a line, with the extremes of every section."""
     count = len(values)
@@ -68,7 +58,7 @@ def round_above(value: float) -> float:
 def new_figure(record: Record, width_in: float, height_in: float) -> Figure:
     """An empty figure with the run's title."""
     figure = Figure(figsize=(max(width_in, NARROWEST_IN), height_in), layout="constrained")
-    figure.suptitle(title(record), fontsize="medium", wrap=True)
+    figure.suptitle(record.title, fontsize="medium", wrap=True)
     return figure
 
 

@@ -12,16 +12,14 @@ from matplotlib.colors import to_rgb
 from matplotlib.patches import Circle, Polygon
 from matplotlib.patheffects import withStroke
 
+from baselines.runs.bodies import axes_of, body_polygons
+from baselines.runs.borders import extent as world_extent
+from baselines.runs.borders import occupied
 from baselines.runs.panels import MOST_POINTS, robot_colour, round_above
 from baselines.runs.run import Record
 from baselines.runs.style import MARKERS, tidy
-from baselines.runs.world import NEAR_MM, draw_world, occupied
-from baselines.runs.world import extent as world_extent
+from baselines.runs.world import NEAR_MM, draw_world
 from tlf_env.rendering.looks import (
-    CASTOR_WIDTH_MM,
-    DRIVE_WHEEL_WIDTH_MM,
-    NOSE,
-    front_mm,
     outline_mm,
 )
 
@@ -32,28 +30,6 @@ SNAPSHOTS = 4  # times at which the robots are drawn, at most
 SNAPSHOT_ROOM = 1.5  # between robots of different times, in outline diameters
 TEXT_ROOMS = (1.5, 2.5, 3.5, 5.0)  # between a robot and its time, in outline radii
 FADED = 0.5
-
-
-def body_polygons(record: Record, row: int, number: int) -> list[np.ndarray]:
-    """A robot at a row, to scale, mm: left wheel, right wheel, castor, nose; each (corner, 2).
-
-    Body axes are e = (cos θ, sin θ), right, and f = (−sin θ, cos θ), forward. The castor's fork is
-    turned by ``castor_rad`` and its wheel trails behind the pivot.
-    """
-    robot = record.scenario.robot_models[number]
-    c = np.array([record["x_mm"][row, number], record["y_mm"][row, number]])
-    theta = record["theta_rad"][row, number]
-    body, fork = _axes_of(theta), _axes_of(theta + record["castor_rad"][row, number])
-    half_mm = robot.axle_width_mm / 2
-    tyre = _rectangle(DRIVE_WHEEL_WIDTH_MM, 2 * robot.wheel_radius_mm)
-    castor = _rectangle(CASTOR_WIDTH_MM, 2 * robot.castor_radius_mm)
-    pivot = c - robot.castor_pivot_mm * body[1]
-    return [
-        c - half_mm * body[0] + tyre @ body,
-        c + half_mm * body[0] + tyre @ body,
-        pivot + (castor - (0, robot.castor_trail_mm)) @ fork,
-        c + front_mm(robot) * np.array(NOSE) @ body,
-    ]
 
 
 def snapshot_rows(record: Record) -> list[int]:
@@ -71,14 +47,6 @@ def snapshot_rows(record: Record) -> list[int]:
             break
         chosen.append(candidates.pop(int(np.argmax(apart))))
     return chosen
-
-
-def _axes_of(theta: float) -> np.ndarray:
-    return np.array([[np.cos(theta), np.sin(theta)], [-np.sin(theta), np.cos(theta)]])
-
-
-def _rectangle(width: float, length: float) -> np.ndarray:
-    return np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) * (width / 2, length / 2)
 
 
 def _places(record: Record) -> np.ndarray:
@@ -142,7 +110,7 @@ def draw_body(record: Record, axes: Axes, row: int, number: int, strength: float
     """A robot at a row, to scale, paler with less strength."""
     robot = record.scenario.robot_models[number]
     line = 1 - strength * (1 - np.array(to_rgb(robot_colour(record, number))))
-    turned = _axes_of(record["theta_rad"][row, number])
+    turned = axes_of(record["theta_rad"][row, number])
     z = 2 + strength
     fill, dark = 1 - 0.3 * (1 - line), 1 - strength * (1 - 0.7 * line)
     if robot.outline_polygon_mm is None:

@@ -102,6 +102,16 @@ class Record:
         """Whether any robot touched another, a wall or an obstacle."""
         return bool(np.isfinite(self.touched_at_s).any())
 
+    @property
+    def title(self) -> str:
+        """Task, policy, disturbance and seed."""
+        disturbance = self.scenario.disturbance
+        level = "" if disturbance.level == 1 else f" × {disturbance.level:g}"
+        return (
+            f"{self.scenario.name}, policy {self.policy}, disturbance {disturbance.name}{level}, "
+            f"seed {self.seed}"
+        )
+
     def metrics(self) -> list[RobotMetrics]:
         """Metrics of every robot."""
         return robot_metrics(

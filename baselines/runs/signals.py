@@ -45,6 +45,9 @@ SIGNALS = (
     "friction_left",
     "friction_right",
     "friction_castor",
+    "tyre_slip_left_mm_s",
+    "tyre_slip_right_mm_s",
+    "tyre_slip_castor_mm_s",
 )
 
 
@@ -68,6 +71,7 @@ class SignalTape:
         """Keep the values after a control step; the action and the reward are those of the step."""
         a = self._arrays
         motion, body = readout.named(a, "motion"), readout.named(a, "body")
+        contact = readout.named(a, "contact")
         estimate, slip = readout.named(a, "estimate"), readout.named(a, "slip")
         reference = readout.reference(a)
         grip = readout.info_of(a, "tyre_friction_scale")[0]
@@ -93,6 +97,9 @@ class SignalTape:
             grip * readout.info_of(a, "tyre_friction_left")[0] * left,
             grip * readout.info_of(a, "tyre_friction_right")[0] * right,
             grip * castor,
+            contact.slip_l[0],
+            contact.slip_r[0],
+            contact.slip_c[0],
             *self._observations[0].T,
             *a.applied[:, :, 0],
         ]

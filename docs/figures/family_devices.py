@@ -23,7 +23,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon
 
-from baselines.runs.plane import body_polygons
+from baselines.runs.bodies import body_polygons
 from baselines.runs.run import run_policy
 from baselines.runs.style import MARKERS
 from tlf_env import BatchPlant
