@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run compile test test-slow test-learning check check-install check-lowest check-clients format board speed speed-docs constraints clean
+.PHONY: help run compile test test-slow test-learning check check-install check-lowest check-clients check-pages browser format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -47,6 +47,14 @@ check: $(VENV)/.stamp-test ## Lint, check format and types
 
 # pip cannot choose the lowest versions, uv can; but it does not read pip's setting of folders of wheels.
 # torch comes first, so that a build of the fixed version in such a folder is taken.
+check-pages: $(VENV)/.stamp-test browser ## Test the pages of HTML in a headless Chromium
+	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e ".[browser]"
+	TLF_BROWSER=needed $(BIN)/pytest tests/browser
+
+browser: ## Install Chromium and its driver, if there are none (Debian's packages, as root)
+	@(command -v chromium || command -v google-chrome) >/dev/null && command -v chromedriver >/dev/null || \
+		{ apt-get update -q && apt-get install -y -q chromium chromium-driver; }
+
 check-lowest: ## Run the tests with the lowest versions that pyproject.toml allows, in a temporary environment
 	@set -e; \
 	tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \

@@ -14,6 +14,7 @@ say "the demo"
 tlf demo --out demo
 test -s demo/demo.png
 test -s demo/residual-slip/summary.json
+grep -q "the paper's loop" demo/replay.html
 
 say "Gymnasium and PettingZoo, from presets and weights in the package"
 python - <<'END'
@@ -36,6 +37,9 @@ tlf show circle --set robots=2 | tlf run - --horizon-s 10 --no-figures
 printf 'base: infinity\nhorizon_s: 8\ntrajectory: flower\n' > based.yaml
 tlf run based.yaml --disturbance slip-noise --policy residual --no-figures
 test -s results/index.html
+tlf run infinity --disturbance slip --horizon-s 10 --no-figures
+tlf run infinity --disturbance slip --horizon-s 10 --no-figures --policy residual
+tlf compare results/infinity-linearised-slip-0-* results/infinity-residual-slip-0-*
 
 say "paths of one's own, in odd forms"
 python - <<'END'

@@ -45,6 +45,7 @@ def test_the_workflow_runs_every_check() -> None:
         "check-install",
         "check-lowest",
         "check-clients",
+        "check-pages",
     }
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
@@ -55,7 +56,7 @@ def test_the_workflow_runs_every_check() -> None:
 def test_the_extra_all_has_everything_but_torch() -> None:
     (everything,) = (one for one in OURS if "train" not in one.extras)
     with_torch = {"train", "benchmarl", "peers"}  # these install it
-    others = {"dev", "ray", "all", "all-train"}
+    others = {"dev", "ray", "browser", "all", "all-train"}
     assert everything.extras == set(EXTRAS) - with_torch - others
     (with_training,) = (one for one in OURS if "train" in one.extras)
     assert with_training.extras == {"all", "train"}

@@ -269,7 +269,7 @@
     const lost = robots.filter((robot) => run.lost(state.t, robot)).length;
     const touched = robots.filter((robot) => run.touched(state.t, robot)).length;
     const rms = Math.max(...robots.map((robot) => run.rms(row, robot)));
-    const since = row > run.row(run.settle_s) ? ` since ${run.settle_s} s` : " so far";
+    const since = row > run.row(run.settle_s) ? ` since ${+run.settle_s.toFixed(3)} s` : " so far";
     words.textContent = `worst error ${run.at("position_error_mm", row, run.worst(row)).toFixed(1)} mm, ` +
       `worst RMS${since} ${rms.toFixed(2)} mm, lost ${lost} of ${run.count}` + (touched ? `, touched ${touched}` : "") +
       (state.t > run.end + 1e-6 ? `; ended at ${+run.end.toFixed(2)} s` : "");
@@ -278,7 +278,7 @@
       const gap = run.t[row] < run.gap_s - 1e-6 || robot === 0 ? NaN : run.at("time_gap_error_s", row, robot);
       const texts = [
         run.at("position_error_mm", row, robot).toFixed(1), run.rms(row, robot).toFixed(2),
-        Number.isNaN(gap) ? "–" : gap.toFixed(3).replace("-", "−"),
+        Replay.fixed(gap, 3),
         `${Math.round(100 * run.at("saturation_fraction", row, robot))} %`,
         run.lost(state.t, robot) ? "lost" : run.touched(state.t, robot) ? "touched" : "",
       ];
@@ -287,6 +287,7 @@
   }
 
   build();
+  Replay.columns = at.columns;  // the plane and the plots of each run
   Replay.fit();
   const asked = /[#&]t=([0-9.]+)/.exec(location.hash);
   if (asked) state.t = Math.min(+asked[1], Replay.end);

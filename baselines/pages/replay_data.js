@@ -115,9 +115,16 @@ const Replay = {};
   Replay.themed = (hex) => {
     const rgb = parsed(hex);
     const light = (0.2126 * rgb[0] + 0.7152 * rgb[1] + 0.0722 * rgb[2]) / 255;
-    if (!Replay.dark() || light > 0.35) return hex;
+    if (!Replay.dark() || light > 0.42) return hex;
     const part = light < 0.1 ? 0.85 : 0.45;
     return `rgb(${rgb.map((one) => Math.round(one + part * (255 - one))).join(",")})`;
+  };
+
+  // A number as text: a true minus, no −0.00, and a dash for what is not defined.
+  Replay.fixed = (value, digits) => {
+    if (Number.isNaN(value)) return "–";
+    const text = value.toFixed(digits);
+    return +text === 0 ? text.replace("-", "") : text.replace("-", "−");
   };
 
   Replay.mixed = (hex, part) => `rgba(${parsed(hex).join(",")},${part})`;

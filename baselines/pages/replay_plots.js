@@ -10,15 +10,15 @@
     { name: "position error", unit: "mm", scale: "log", each: "position_error_mm", digits: 2 },
     { name: "time-gap error", unit: "s", scale: "symlog", linear: 0.01, each: "time_gap_error_s", followers: true, digits: 4 },
     {
-      name: "wheel torques", unit: "N·mm", scale: "linear", digits: 1, limit: "limit_Nmm",
+      name: "wheel torques", short: "torques", unit: "N·mm", scale: "linear", digits: 1, limit: "limit_Nmm",
       lines: [["left", "torque_l_Nmm", 0], ["right", "torque_r_Nmm", 1]],
     },
     {
-      name: "slip δ₁, along the body", unit: "mm/s", scale: "linear", digits: 1,
+      name: "slip δ₁, along the body", short: "slip δ₁", unit: "mm/s", scale: "linear", digits: 1,
       lines: [["true", "slip_1_mm_s", 0], ["estimated", "estimated_slip_1_mm_s", 1]],
     },
     {
-      name: "slip δ₂, about the vertical", unit: "rad/s", scale: "linear", digits: 3,
+      name: "slip δ₂, about the vertical", short: "slip δ₂", unit: "rad/s", scale: "linear", digits: 3,
       lines: [["true", "slip_2_rad_s", 0], ["estimated", "estimated_slip_2_rad_s", 1]],
     },
   ];
@@ -153,7 +153,7 @@
       const shown = this.plot.each ? this.lines.filter((line) => line.bold) : this.lines;
       for (const line of [...shown].reverse()) {
         const value = Replay.valueOf(this.plot, this.run, line, row);
-        const digits = Number.isNaN(value) ? "–" : value.toFixed(this.plot.digits).replace("-", "−");
+        const digits = Replay.fixed(value, this.plot.digits);
         const words = `${line.name} ${digits}`;
         pen.fillStyle = line.colour;
         pen.fillText(words, right, 14);
@@ -224,7 +224,8 @@
       pen.textAlign = "left";
       pen.fillStyle = Replay.css("ink");
       const who = plot.lines ? `, robot ${Math.min(state.chosen, run.count - 1)}` : "";
-      pen.fillText(`${plot.name}${who} (${plot.unit})`, 4, 14);
+      const name = width < 520 && plot.short ? plot.short : plot.name;
+      pen.fillText(`${name}${who} (${plot.unit})`, 4, 14);
       pen.save();
       pen.beginPath();
       pen.rect(LEFT, TOP - 1, width - LEFT - RIGHT, height - TOP - BOTTOM + 2);

@@ -32,6 +32,7 @@ WINGS = (
     "commands",
     "policies",
     "runs",
+    "pages",
     "paths",
     "data",
     "benchmark",

@@ -8,7 +8,7 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 import pytest
 
@@ -32,16 +32,27 @@ def program(variable: str, *names: str) -> str | None:
     return next(filter(None, found), None)
 
 
+def without(what: str) -> NoReturn:
+    """Skip, or fail if the variable ``TLF_BROWSER`` says that the browser is needed."""
+    message = f"needs {what}"
+    if os.environ.get("TLF_BROWSER"):
+        pytest.fail(message)
+    pytest.skip(message)
+
+
 @pytest.fixture(scope="session")
 def _chromium(tmp_path_factory) -> Iterator[Any]:
     """One browser for all tests."""
-    webdriver = pytest.importorskip("selenium.webdriver", reason="needs selenium")
-    from selenium.webdriver.chrome.service import Service
+    try:
+        from selenium import webdriver
+        from selenium.webdriver.chrome.service import Service
+    except ModuleNotFoundError:
+        without("selenium")
 
     chromium = program("TLF_CHROMIUM", "/usr/bin/chromium", "chromium", "google-chrome")
     driver = program("TLF_CHROMEDRIVER", "/usr/bin/chromedriver", "chromedriver")
     if chromium is None or driver is None:
-        pytest.skip("needs Chromium and its driver")
+        without("Chromium and its driver")
     options = webdriver.ChromeOptions()
     options.binary_location = chromium
     for flag in (*FLAGS, f"--user-data-dir={tmp_path_factory.mktemp('chromium')}"):
