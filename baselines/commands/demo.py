@@ -20,7 +20,7 @@ TASK = "infinity"
 HORIZON_S = 60.0
 PICTURE = "demo.png"
 NEXT = (
-    ("tlf run flower", "another task, with all figures of one run"),
+    ("tlf run flower", "another task, with a replay and all figures of one run"),
     ("tlf run infinity --disturbance ice --policy residual", "the learned policy on ice"),
     ("tlf list", "every task, disturbance, policy and training"),
     ("tlf show infinity > own.yaml; tlf run own.yaml", "a task of your own"),
