@@ -220,7 +220,7 @@ def run(
         bool, typer.Option("--json", help="Print summary.json instead of the table.")
     ] = False,
 ) -> None:
-    """Run a policy in a scenario to its horizon; write table, summary, data and figures."""
+    """Run a policy in a scenario to its horizon; write table, summary, data, replay page and figures."""
     from baselines.commands.run import Wanted, run_command
     from baselines.commands.scenarios import asked_scenario
 

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from baselines.pages.replay import write_comparison, write_replay
+from baselines.policies.reference import ReferencePolicy
 from baselines.policies.registry import fit_policy
 from baselines.runs.run import Record, run_policy
 from tlf_env.task.scenario import load_scenario
@@ -238,4 +239,46 @@ def test_a_name_stays_text(records, tmp_path, at, complaints):
     assert page.title != "ran"
     page = at(write_replay(record, tmp_path / "one.html"), 1.0)
     assert HOSTILE in page.find_element("css selector", "h1").text
+    assert not complaints()
+
+
+class Aborted(ReferencePolicy):
+    """Interrupted in its 51st step."""
+
+    calls = 0
+
+    def predict(self, *args, **kwargs):
+        self.calls += 1
+        if self.calls > 50:
+            raise KeyboardInterrupt
+        return super().predict(*args, **kwargs)
+
+
+def test_an_aborted_run_is_replayed_to_its_end(tmp_path, at, complaints):
+    record = run_policy(load_scenario("infinity"), Aborted(), 0, name="aborted")
+    page = at(write_replay(record, tmp_path / "replay.html"), 60.0)
+    assert state(page, "t") == pytest.approx(1.0)
+    assert "interrupted after 1 s of" in page.find_element("css selector", "header").text
+    assert not complaints()
+
+
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {"robots": 1},
+        {"robots": 12, "horizon_s": 1.0},
+        {"plant": "kinematic"},
+        {"horizon_s": 0.02},
+        {"disturbance": {"tyre": {"friction_scale": 0.02}}},
+    ],
+)
+def test_odd_runs_are_drawn(fields, tmp_path, at, complaints, phone, overflow):
+    scenario = load_scenario("circle", **({"horizon_s": 6.0} | fields))
+    record = run_policy(scenario, ReferencePolicy(), 0, name="odd")
+    page = at(write_replay(record, tmp_path / "replay.html"), 0.5)
+    rows = page.find_elements("css selector", "table.robots tbody tr")
+    assert len(rows) == record.robots
+    press(page, "End")
+    assert state(page, "t") == pytest.approx(record.t_s[-1], abs=1e-5)
+    assert overflow() == []
     assert not complaints()
