@@ -25,7 +25,6 @@ from baselines.console import (
     print_on_any_terminal,
     progress_bar,
     screen,
-    warn_of_missing,
     warn_of_scenarios,
     whole_numbers,
     writable_folder,
@@ -34,7 +33,7 @@ from tlf_env.common.errors import install_command
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 
 BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130
-RESUMED = ("bench", "train", "tune")  # commands that go on where they were interrupted
+RESUMED = ("bench", "eval", "train", "tune")  # commands that go on where they were interrupted
 
 app = typer.Typer(
     help="Time-gap leader-follower formations of wheeled robots that slip.",
@@ -129,6 +128,11 @@ SETTINGS = typer.Option(
 RAY = typer.Option(help="Address of an existing Ray cluster to run on instead.")
 TRUST = typer.Option(
     "--trust", help="Load SB3 .zip files and run entries' programs: code that they contain."
+)
+
+REPLAYS = typer.Option(
+    min=0,
+    help="Pages of replays beside report.html: the worst and the median run of the most telling cells.",
 )
 
 
@@ -546,6 +550,7 @@ def bench(
         typer.Option(help="Folder of the results; default results/bench or results/test."),
     ] = None,
     figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    replays: Annotated[int, REPLAYS] = 6,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print leaderboard.json instead of the tables.")
     ] = False,
@@ -589,8 +594,8 @@ def bench(
         parse_seeds,
         parse_sweep,
     )
+    from baselines.commands.bench import Wanted, finish
     from baselines.runs.provenance import command_line
-    from baselines.tables import board_table
 
     path, values = parse_sweep(sweep) if sweep else (None, ())
     asked = Plan(
@@ -620,15 +625,64 @@ def bench(
             ray_address=ray,
             progress=update,
         )
-    from baselines.benchmark.aggregate import write_leaderboard
+    finish(
+        results,
+        Wanted(figures=figures, replays=replays, as_json=as_json),
+        command_line(sys.argv[1:]),
+    )
 
-    command = command_line(sys.argv[1:])
-    board = write_leaderboard(results, out, command, draw_bench if figures else None)
-    if as_json:
-        typer.echo(json.dumps(board, indent=1, allow_nan=False))
-    else:
-        screen.print(board_table(board))
-        screen.print(f"In {out}: runs.jsonl, leaderboard.md, leaderboard.json", soft_wrap=True)
+
+@app.command("eval", epilog=examples("eval"))
+def eval_(
+    policy: Annotated[
+        str,
+        typer.Argument(help="As in `tlf run --policy`.", autocompletion=completed("policies")),
+    ],
+    against: Annotated[
+        str,
+        typer.Option(
+            help="The policy that it is compared with.", autocompletion=completed("policies")
+        ),
+    ] = f"reference:{DEFAULT_CONTROLLER}",
+    tasks: Annotated[str, typer.Option(help="Scenarios, comma-separated.")] = "infinity,flower",
+    disturbances: Annotated[
+        str, typer.Option(help="Disturbances, comma-separated: presets or FILE.yaml; or all.")
+    ] = "nominal,slip,ice,combined-medium",
+    seeds: Annotated[
+        str, typer.Option(help="Seeds FIRST:END; END itself is not run.")
+    ] = "20000:20020",
+    horizon_s: Annotated[float, typer.Option(help="Length of each run, s.")] = 60.0,
+    plant: Annotated[
+        str,
+        typer.Option(help="batch (seeds side by side, no contact), pymunk, kinematic or chipmunk."),
+    ] = "batch",
+    processes: Annotated[int, typer.Option(help="Processes on this machine; 0: one per core.")] = 0,
+    trust: Annotated[bool, TRUST] = False,
+    out: Annotated[
+        Path | None, typer.Option(help="Folder of the results; default results/eval/POLICY.")
+    ] = None,
+    figures: Annotated[bool, typer.Option(help="Draw the figures.")] = True,
+    replays: Annotated[int, REPLAYS] = 4,
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print the comparison as JSON instead of the table.")
+    ] = False,
+) -> None:
+    """Compare one policy with the default, in a minute or two. Call it again to continue."""
+    from baselines.commands.bench import Wanted
+    from baselines.commands.eval import eval_command
+
+    eval_command(
+        policy,
+        against,
+        tasks=tasks,
+        disturbances=disturbances,
+        seeds=seeds,
+        overrides={"horizon_s": horizon_s, "plant": plant},
+        out=out,
+        processes=processes or os.cpu_count() or 1,
+        wanted=Wanted(figures=figures, replays=replays, as_json=as_json),
+        trust=trust,
+    )
 
 
 def refuse_beside_test(ctx: typer.Context, option_given: str = "--test") -> None:
@@ -838,16 +892,6 @@ def compile_(
     from baselines.commands.compile import ALL, USUAL, compile_drivers
 
     compile_drivers(ALL if everything else USUAL)
-
-
-def draw_bench(board: dict[str, Any], folder: Path) -> list[Path]:
-    """The benchmark's figures; none, and a note, if matplotlib is missing."""
-    try:
-        from baselines.benchmark.figures import write_bench_figures
-    except ModuleNotFoundError as error:
-        warn_of_missing(error)
-        return []
-    return write_bench_figures(board, folder)
 
 
 def main() -> None:

@@ -287,7 +287,7 @@ def test_a_sweep_of_a_field_of_the_scenario_keeps_the_disturbance():
 
 
 def test_a_logarithmic_sweep_has_equal_ratios():
-    from baselines.benchmark.sweep_figure import is_geometric
+    from baselines.benchmark.knobs import is_geometric
 
     _, values = parse_sweep("slip.delta_1_mm_s.frequency_hz=0.05:2:9:log")
     assert (values[0], values[-1]) == (0.05, 2.0)
@@ -443,7 +443,7 @@ def test_small_panels_share_a_column():
 def test_the_figures_are_drawn_from_what_the_table_holds(tmp_path):
     pytest.importorskip("matplotlib")
     from baselines.benchmark.figures import write_bench_figures
-    from baselines.benchmark.sweep_figure import knob_label
+    from baselines.benchmark.knobs import knob_label
 
     board = write_leaderboard(run_bench(PLAN, tmp_path), tmp_path, "tlf bench")
     written = write_bench_figures(board, tmp_path)

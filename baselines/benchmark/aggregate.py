@@ -19,9 +19,9 @@ from baselines.benchmark.lines import (
     Line,
     Strata,
     failures,
+    grouped,
     run_score,
     step_times,
-    stratum_of,
     worst,
 )
 from baselines.benchmark.page import PAIRED, markdown
@@ -69,9 +69,7 @@ def leaderboard(results: Results, command: str = "") -> dict[str, Any]:
     ValueError
         if policies that are compared have not run the same seeds.
     """
-    groups: dict[str, Strata] = {}
-    for line in results.ordered():
-        groups.setdefault(line["policy"], {}).setdefault(stratum_of(line), []).append(line)
+    groups = grouped(results.ordered())
     reference = reference_of(list(groups))
     cells = [
         {

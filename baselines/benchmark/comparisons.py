@@ -7,11 +7,13 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
+from scipy.stats import binomtest
 
 from baselines.benchmark.lines import Line, Strata, failures, stratum_of, worst
 from baselines.benchmark.statistics import paired
 from baselines.policies.registry import policy_names
 from baselines.policies.systems import parse_system
+from baselines.runs.outcome import failed
 from tlf_env.common.presets import preset_names
 
 COMPARED = {  # metric: how a policy is compared with its rival, both at the run's worst robot
@@ -19,6 +21,8 @@ COMPARED = {  # metric: how a policy is compared with its rival, both at the run
     "error_capped_mean_mm": "difference",
     "torque_rms_Nmm": "ratio",
 }
+
+SIGNIFICANT = 0.05
 
 
 def comparisons(groups: Mapping[str, Strata], ranked: Sequence[str]) -> list[dict[str, Any]]:
@@ -97,3 +101,43 @@ def comparison(mine: Sequence[Line], theirs: Sequence[Line]) -> dict[str, Any]:
             for metric, how in COMPARED.items()
         },
     }
+
+
+def only_one_failed(mine: Sequence[Line], theirs: Sequence[Line]) -> tuple[int, int]:
+    """The number of seeds of which only the first policy fails, and only the second."""
+    other = {line["seed"]: failed(line["robots"]) for line in theirs}
+    pairs = [
+        (failed(line["robots"]), other[line["seed"]]) for line in mine if line["seed"] in other
+    ]
+    return sum(a and not b for a, b in pairs), sum(b and not a for a, b in pairs)
+
+
+def in_words(row: Mapping[str, Any], only: tuple[int, int]) -> str:
+    """A comparison in one stratum in words: ``better: …``, ``worse: …``, ``no difference``, or ``unclear: …``.
+
+    Failures come first: by the exact sign test of the seeds that only one of them fails. Where it finds no
+    difference, the interval of the paired differences of the position RMS decides, unless failures point the
+    other way, or both fail in most runs.
+
+    Parameters
+    ----------
+    row
+        As of :func:`comparison`.
+    only
+        As of :func:`only_one_failed`.
+    """
+    mine, theirs = row["failed"]
+    ends = row["position_rmse_mm"]["interval"]
+    if sum(only) and binomtest(only[0], sum(only)).pvalue < SIGNIFICANT:
+        return "better: fails less" if only[0] < only[1] else "worse: fails more"
+    if 2 * min(mine, theirs) > row["runs"]:
+        return "no difference: both fail"
+    if ends is None:
+        return "too few runs"
+    if ends[1] < 0:
+        return (
+            "better: smaller error" if mine <= theirs else "unclear: smaller error, more failures"
+        )
+    if ends[0] > 0:
+        return "worse: larger error" if mine >= theirs else "unclear: larger error, fewer failures"
+    return "no difference"

@@ -21,9 +21,9 @@ from scipy.stats import binom
 
 from baselines.benchmark.envelope import CONFIDENCE, HELD_SHARE, Envelope, Probe, envelope
 from baselines.benchmark.envelope_runs import PLAN_FILE, EnvelopeResults, middle
+from baselines.benchmark.knobs import unit_of
 from baselines.benchmark.lines import BESIDE
 from baselines.benchmark.page import figure_title, number, policy_label
-from baselines.benchmark.sweep_figure import unit_of
 from tlf_env.common.files import atomic
 
 BOARD_FILE, PAGE_FILE = "envelope.json", "envelope.md"

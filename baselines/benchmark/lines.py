@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -47,6 +47,14 @@ def run_score(line: Line) -> float:
 def stratum_of(line: Line) -> Stratum:
     """Task, disturbance and swept value of a line."""
     return line["task"], line["disturbance"], line["sweep"]
+
+
+def grouped(lines: Iterable[Line]) -> dict[str, Strata]:
+    """The lines of each policy and stratum, in their order."""
+    groups: dict[str, Strata] = {}
+    for line in lines:
+        groups.setdefault(line["policy"], {}).setdefault(stratum_of(line), []).append(line)
+    return groups
 
 
 def step_times(lines: Sequence[Line]) -> dict[str, float] | None:

@@ -24,22 +24,11 @@ from baselines.benchmark.drawing import (
     tasks_of,
     tidy_panels,
 )
+from baselines.benchmark.knobs import is_geometric, knob_label
 from baselines.runs.style import GREY
 
 ERROR_METRIC, ERROR_LABEL = "position_rmse_mm", "position RMS of the worst robot (mm)"
 BAND = 0.12  # opacity of an interval's band
-UNITS = {
-    "_Nmm": "N·mm",
-    "_N": "N",
-    "_hz": "Hz",
-    "_kg_mm2": "kg·mm²",
-    "_rad_s": "rad/s",
-    "_mm_s": "mm/s",
-    "_rad": "rad",
-    "_kg": "kg",
-    "_mm": "mm",
-    "_s": "s",
-}
 
 
 def draw_sweep(board: Board) -> Figure:
@@ -115,26 +104,3 @@ def _breaking_marks(board: Board, axes: Axes, task: str, disturbance: str) -> No
                 axes.plot(
                     [at, at], ends, color=style["color"], lw=0.8 * style["lw"], ls=line, zorder=1.5
                 )
-
-
-def is_geometric(values: Sequence[float]) -> bool:
-    """Whether values are evenly spaced on a logarithmic scale rather than on a linear one."""
-    known = np.unique(values)
-    if len(known) < 3 or known[0] <= 0:
-        return False
-    steps, ratios = np.diff(known), np.diff(np.log(known))
-    return bool(np.ptp(ratios) / ratios.mean() < np.ptp(steps) / steps.mean())
-
-
-def knob_label(path: str) -> str:
-    """A knob and the unit at the end of its name: ``slip.delta_1_mm_s`` → ``slip.delta_1 (mm/s)``."""
-    unit = unit_of(path)
-    if unit is None:
-        return path
-    suffix = next(suffix for suffix, name in UNITS.items() if name == unit)
-    return f"{path.removesuffix(suffix)} ({unit})"
-
-
-def unit_of(name: str) -> str | None:
-    """The unit at the end of a name: ``delta_1_mm_s`` → ``mm/s``; None without one."""
-    return next((unit for suffix, unit in UNITS.items() if name.endswith(suffix)), None)

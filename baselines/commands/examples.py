@@ -43,6 +43,11 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "tlf bench --check infinity:slip": "a cell of the published board again, digit for digit",
         "tlf bench --plan board --out results/board": "the whole board, about two hours of a core",
     },
+    "eval": {
+        "tlf eval residual": "a shipped policy against the default, a minute or two",
+        "tlf eval my.safetensors --disturbances all --seeds 20000:20050": "your own, under everything",
+        "tlf eval my.zip --trust --against residual": "a policy of SB3 against another one",
+    },
     "export": {
         "tlf export infinity --policy reference --seeds 0:20 --out data": "20 runs as an offline data set",
     },
