@@ -586,7 +586,7 @@ def bench(
         )
         return
     out = out or Path("results/bench")
-    from baselines.benchmark.bench import named_scenarios, run_bench
+    from baselines.benchmark.bench import named_scenarios, need_tables, run_bench
     from baselines.benchmark.plan import (
         Plan,
         disturbance_presets,
@@ -594,9 +594,9 @@ def bench(
         parse_seeds,
         parse_sweep,
     )
-    from baselines.commands.bench import Wanted, finish
     from baselines.runs.provenance import command_line
 
+    need_tables()
     path, values = parse_sweep(sweep) if sweep else (None, ())
     asked = Plan(
         policies=names,
@@ -625,6 +625,8 @@ def bench(
             ray_address=ray,
             progress=update,
         )
+    from baselines.commands.bench import Wanted, finish
+
     finish(
         results,
         Wanted(figures=figures, replays=replays, as_json=as_json),
@@ -668,6 +670,9 @@ def eval_(
     ] = False,
 ) -> None:
     """Compare one policy with the default, in a minute or two. Call it again to continue."""
+    from baselines.benchmark.bench import need_tables
+
+    need_tables()
     from baselines.commands.bench import Wanted
     from baselines.commands.eval import eval_command
 

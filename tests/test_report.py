@@ -7,6 +7,7 @@ import json
 import re
 import shlex
 import statistics
+import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -407,6 +408,8 @@ def row(failed=(0, 0), ends=(-1.0, 1.0), runs=10):
         (row((0, 2), (1, 2)), (0, 2), "unclear: larger error, fewer failures"),
         (row((9, 9), (1, 2)), (1, 1), "no difference: both fail"),
         (row(ends=None, runs=1), (0, 0), "too few runs"),
+        (row(ends=(1, 2), runs=5), (0, 0), "too few runs"),
+        (row(ends=(1, 2), runs=6), (0, 0), "worse: larger error"),
     ],
 )
 def test_a_verdict_weighs_failures_first(found, only, said):
@@ -432,7 +435,7 @@ def test_a_summary_counts_the_verdicts():
     assert full_name("residual") == "residual"
 
 
-EVAL = "--tasks infinity --disturbances nominal --seeds 20000:20003 --horizon-s 2 --no-figures --processes 1"
+EVAL = "--tasks infinity --disturbances nominal --seeds 20000:20006 --horizon-s 2 --no-figures --processes 1"
 
 
 def test_eval_compares_a_file_with_the_default_and_is_resumed(tmp_path, monkeypatch, capsys):
@@ -459,7 +462,7 @@ def test_eval_compares_a_file_with_the_default_and_is_resumed(tmp_path, monkeypa
     found = json.loads(capsys.readouterr().out)
     (cell,) = found["cells"]
     assert (found["policy"], found["against"]) == ("still:Still", "reference:linearised")
-    assert (cell["verdict"], cell["runs"]) == ("worse: larger error", 3)
+    assert (cell["verdict"], cell["runs"]) == ("worse: larger error", 6)
     assert cell["medians"][0] > cell["medians"][1]
     assert cli.interrupted_message(["eval", "residual"]).endswith("goes on: tlf eval residual")
 
@@ -491,6 +494,33 @@ def test_eval_refuses_bad_input_in_one_line(words, said, tmp_path, monkeypatch, 
     assert "\n" not in shown.strip()
     assert said in shown
     assert not list(tmp_path.rglob("*.jsonl"))
+
+
+@pytest.mark.parametrize("words", ["bench --policies pure_pursuit", "eval residual"])
+def test_without_arch_the_command_says_what_is_missing_before_it_runs(words, tmp_path):
+    """In a process of its own, in which nothing is imported yet."""
+    arguments = ["tlf", *words.split(), "--out", str(tmp_path / "out")]
+    code = (
+        "import sys; sys.modules['arch'] = None\n"
+        f"sys.argv = {arguments!r}\n"
+        "from baselines.cli import main; main()"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120)
+    assert done.returncode == cli.BAD_INPUT
+    assert done.stderr.count("\n") == 1
+    assert "tlf-env[bench]" in done.stderr
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_time_of_a_step_is_shown_where_it_is_known(tmp_path):
+    lines = [line(), line("entry:mine")]
+    board, plan = made(lines, tmp_path)
+    assert "time per step, ms" not in report_page(board, plan, [])
+    board["policies"][0]["step_ms"] = {"median": 1.25, "p99": 2.0, "largest": 9.0, "late": 0.5}
+    source = report_page(board, plan, [])
+    assert "time per step, ms" in source
+    assert "1.25" in source
+    assert "50.00" in source
 
 
 def test_the_headlines_are_run_once(tmp_path):

@@ -104,6 +104,18 @@ def blocks(plan: Plan, episodes: Sequence[Episode]) -> list[tuple[Episode, ...]]
     return sorted(parts, key=lambda part: place[part[0]])
 
 
+def need_tables() -> None:
+    """Check that what the tables are made with is installed.
+
+    Raises
+    ------
+    ValueError
+        with the command that installs it.
+    """
+    if find_spec("arch") is None:
+        raise ValueError(f"the tables need arch ({install_command('bench')})")
+
+
 def run_bench(
     plan: Plan,
     folder: Path,
@@ -127,8 +139,7 @@ def run_bench(
     """
     if processes < 1:
         raise ValueError(f"processes {processes} must be at least 1")
-    if find_spec("arch") is None:
-        raise ValueError(f"the tables need arch ({install_command('bench')})")
+    need_tables()
     results = Results(folder, plan)
     begin()
     todo = results.missing()

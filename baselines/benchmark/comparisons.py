@@ -23,6 +23,9 @@ COMPARED = {  # metric: how a policy is compared with its rival, both at the run
 }
 
 SIGNIFICANT = 0.05
+LEAST_RUNS = (
+    6  # of fewer pairs, even differences that all have one sign are no evidence at that level
+)
 
 
 def comparisons(groups: Mapping[str, Strata], ranked: Sequence[str]) -> list[dict[str, Any]]:
@@ -117,7 +120,7 @@ def in_words(row: Mapping[str, Any], only: tuple[int, int]) -> str:
 
     Failures come first: by the exact sign test of the seeds that only one of them fails. Where it finds no
     difference, the interval of the paired differences of the position RMS decides, unless failures point the
-    other way, or both fail in most runs.
+    other way, or both fail in most runs, or there are fewer than :data:`LEAST_RUNS`.
 
     Parameters
     ----------
@@ -130,10 +133,10 @@ def in_words(row: Mapping[str, Any], only: tuple[int, int]) -> str:
     ends = row["position_rmse_mm"]["interval"]
     if sum(only) and binomtest(only[0], sum(only)).pvalue < SIGNIFICANT:
         return "better: fails less" if only[0] < only[1] else "worse: fails more"
+    if ends is None or row["runs"] < LEAST_RUNS:
+        return "too few runs"
     if 2 * min(mine, theirs) > row["runs"]:
         return "no difference: both fail"
-    if ends is None:
-        return "too few runs"
     if ends[1] < 0:
         return (
             "better: smaller error" if mine <= theirs else "unclear: smaller error, more failures"

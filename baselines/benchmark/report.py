@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from baselines.benchmark.comparisons import in_words, only_one_failed
+from baselines.benchmark.comparisons import LEAST_RUNS, in_words, only_one_failed
 from baselines.benchmark.knobs import is_geometric, knob_label
 from baselines.benchmark.lines import Line, Strata, grouped
 from baselines.benchmark.notable import Commands, key_of, notable
@@ -38,7 +38,6 @@ class Metric(NamedTuple):
     digits: int
     good: str  # "low" or "high"
     log: bool  # colours by ratios
-    short: str = ""  # heading of its column, if the title is too long
 
 
 METRICS = (
@@ -46,11 +45,16 @@ METRICS = (
     Metric("failed", "failed runs", "%", 0, "low", False),
     Metric("score", "score", "", 1, "high", False),
     Metric("settled_formation_rmse_mm", "formation RMS", "mm", 1, "low", True),
-    Metric("error_capped_mean_mm", "capped mean error", "mm", 1, "low", True, "capped mean"),
+    Metric("error_capped_mean_mm", "capped mean", "mm", 1, "low", True),
     Metric("torque_rms_Nmm", "torque RMS", "N·mm", 1, "low", False),
 )
 COLUMNS = (  # what the headings of the tables mean, beside the definitions of the leaderboard's page
     ("failed", "runs in which a robot was lost or touched something; the interval is Wilson's"),
+    (
+        "time per step",
+        "from observations to actions, all robots together, of entries that are processes of their own; a step "
+        "is late if it takes longer than a control period",
+    ),
     (
         "median run",
         "the seed whose position RMS of the worst robot is the median (the lower one of two); its command runs "
@@ -63,8 +67,8 @@ COLUMNS = (  # what the headings of the tables mean, beside the definitions of t
     (
         "verdict",
         "on the same seeds for both: first the exact sign test of the seeds that only one of them fails, then "
-        "whether the interval of the differences of the position RMS excludes 0. Without any true difference, "
-        "one row in twenty has a verdict by chance",
+        f"whether the interval of the differences of the position RMS excludes 0; none for fewer than "
+        f"{LEAST_RUNS} runs. Without any true difference, one row in twenty has a verdict by chance",
     ),
 )
 
@@ -237,7 +241,9 @@ def with_span(value: float | None, ends: Sequence[float] | None, digits: int) ->
 
 def policies_table(board: Mapping[str, Any]) -> str:
     """The policies over all tasks and disturbances, by score."""
-    headings = ("policy", "score", "normalised", "better than the reference", "failed", "runs")
+    headings = ["policy", "score", "normalised", "better than the reference", "failed", "runs"]
+    timed = any("step_ms" in row for row in board["policies"])
+    headings += ["time per step, ms", "late steps, %"] if timed else []
     rows = []
     for row in board["policies"]:
         scaled, better = row["normalised_score"], row["probability_of_improvement"]
@@ -249,6 +255,13 @@ def policies_table(board: Mapping[str, Any]) -> str:
             cell(row["failed"], row["failed"]),
             cell(row["runs"], row["runs"]),
         ]
+        if timed:
+            times = row.get("step_ms", {"median": None, "late": None})
+            late = None if times["late"] is None else 100 * times["late"]
+            cells += [
+                Cell(number(times["median"], 2), times["median"]),
+                Cell(number(late, 2), late),
+            ]
         rows.append(("", cells))
     reference = board["reference"]
     note = f'<p class="soft">Reference: {text(reference)}.</p>' if reference else ""
@@ -303,7 +316,7 @@ def cells_table(
         "policy",
         "task",
         "disturbance",
-        *(metric.short or metric.title for metric in METRICS),
+        *(metric.title for metric in METRICS),
     ]
     headings += ["median run", "worst run"] if groups else []
     rows = []

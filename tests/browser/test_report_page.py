@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import itertools
 import math
 import os
 from dataclasses import replace
@@ -12,6 +13,7 @@ import pytest
 
 pytest.importorskip("selenium", reason="needs selenium")
 pytest.importorskip("arch", reason="needs the extra bench")
+pytest.importorskip("matplotlib", reason="needs the extra figures")
 
 from selenium.webdriver.common.by import By
 from selenium.webdriver.common.keys import Keys
@@ -83,7 +85,7 @@ def in_order(values: list[str], down: bool) -> bool:
         keys: list = [float(value) for value in known]
     except ValueError:
         keys = [value.casefold() for value in known]
-    pairs = zip(keys, keys[1:], strict=False)
+    pairs = itertools.pairwise(keys)
     return all(a >= b if down else a <= b for a, b in pairs)
 
 
@@ -239,7 +241,7 @@ def contrast(browser, selector: str) -> float:
         let least = 99;
         for (const one of document.querySelectorAll(arguments[0])) {
           let ground = one;
-          while (ground && pixel(getComputedStyle(ground).backgroundColor)[3] === 0) ground = ground.parentElement;
+          while (ground && !pixel(getComputedStyle(ground).backgroundColor)[3]) ground = ground.parentElement;
           const a = light(pixel(getComputedStyle(one).color));
           const b = light(pixel(getComputedStyle(ground || document.body).backgroundColor));
           least = Math.min(least, (Math.max(a, b) + 0.05) / (Math.min(a, b) + 0.05));
