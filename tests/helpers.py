@@ -163,7 +163,8 @@ def benched(folder: Path, plan: str, words: str) -> Path:
 
     (folder / "plan.yaml").write_text(plan)
     with pytest.MonkeyPatch.context() as patch:
-        given = f"bench --plan {folder}/plan.yaml --no-figures --processes 1 --out {folder}/made {words}"
+        places = f"--plan {folder}/plan.yaml --out {folder}/made"
+        given = f"bench {places} --no-figures --replays 0 --processes 1 {words}"
         patch.setattr(sys, "argv", ["tlf", *given.split()])
         main()
     return folder / "made"
