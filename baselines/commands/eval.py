@@ -73,8 +73,9 @@ def eval_command(
         results = run_bench(plan, folder, processes=processes, progress=update)
     rows = compared_cells(results)
     write_all(results, wanted, command_line(sys.argv[1:]), rows)
+    shown = {"policy": policy, "against": against, "cells": rows}
     if wanted.as_json:
-        typer.echo(json.dumps({"policy": policy, "against": against, "cells": rows}, indent=1))
+        typer.echo(json.dumps(shown, indent=1, allow_nan=False))
         return
     screen.print(eval_table(rows, f"{policy} against {against}, seeds {seeds}"))
     screen.print(f"{policy}: {summary_of(rows)}", soft_wrap=True)
