@@ -116,7 +116,7 @@ def write_replays(
 ) -> list[Replay]:
     """Run some episodes again and write their pages into ``replays`` of a folder.
 
-    A run that is wanted as median and as worst is run once.
+    A run that is wanted as median and as worst is run once. Pages of an earlier choice are removed.
 
     Parameters
     ----------
@@ -134,6 +134,10 @@ def write_replays(
             made[episode] = Replay(line, what, file, differences(record, line))
         if progress is not None:
             progress(done, len(wanted))
+    kept = {one.file for one in made.values()}
+    for path in (folder / FOLDER).glob("*.html"):
+        if f"{FOLDER}/{path.name}" not in kept:
+            path.unlink()
     return [made[Episode.of_line(line)]._replace(what=what) for line, what in wanted]
 
 

@@ -14,8 +14,8 @@ from baselines.benchmark.replays import Replay, headline, write_replays
 from baselines.benchmark.report import REPORT_FILE, write_report
 from baselines.benchmark.results import BOARD_FILE, PAGE_FILE, RUNS_FILE, Results
 from baselines.console import notes, progress_bar, screen, warn_of_missing
+from baselines.pages.replay import write_replay
 from baselines.tables import board_table
-from tlf_env.common.errors import install_command
 
 
 class Wanted(NamedTuple):
@@ -64,13 +64,6 @@ def print_files(folder: Path) -> None:
 def replay_some(results: Results, board: Mapping[str, Any], count: int) -> list[Replay]:
     """Replays of the most telling runs, written; a note for each that is not the run in the table."""
     if count < 1:
-        return []
-    try:
-        from baselines.pages.replay import write_replay
-    except ModuleNotFoundError as error:
-        notes.print(
-            f"No replays: {error.name} is missing ({install_command('figures')}).", soft_wrap=True
-        )
         return []
     ranked = [row["policy"] for row in board["policies"]]
     chosen = headline(results.ordered(), ranked, count)

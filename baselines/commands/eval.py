@@ -17,13 +17,15 @@ from baselines.benchmark.bench import named_scenarios, run_bench
 from baselines.benchmark.comparisons import comparison, in_words, only_one_failed
 from baselines.benchmark.lines import grouped, worst
 from baselines.benchmark.page import number, span, stratum_name
-from baselines.benchmark.plan import Plan, disturbance_presets, parse_seeds
+from baselines.benchmark.plan import Episode, Plan, disturbance_presets, parse_seeds
+from baselines.benchmark.replays import headline, record_of
 from baselines.benchmark.results import Results
 from baselines.benchmark.statistics import median
 from baselines.commands.bench import Wanted, print_files, write_all
 from baselines.commands.compile import compile_before_first_run
 from baselines.console import listed, progress_bar, screen, warn_of_scenarios
-from baselines.runs.folders import LONGEST, NOT_IN_FOLDERS
+from baselines.pages.replay import write_comparison
+from baselines.runs.folders import LONGEST, NOT_IN_FOLDERS, REPLAY
 from baselines.runs.provenance import command_line
 from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
 
@@ -73,6 +75,7 @@ def eval_command(
         results = run_bench(plan, folder, processes=processes, progress=update)
     rows = compared_cells(results)
     write_all(results, wanted, command_line(sys.argv[1:]), rows)
+    beside = replay_both(results, folder) if wanted.replays else None
     shown = {"policy": policy, "against": against, "cells": rows}
     if wanted.as_json:
         typer.echo(json.dumps(shown, indent=1, allow_nan=False))
@@ -80,6 +83,17 @@ def eval_command(
     screen.print(eval_table(rows, f"{policy} against {against}, seeds {seeds}"))
     screen.print(f"{policy}: {summary_of(rows)}", soft_wrap=True)
     print_files(folder)
+    if beside is not None:
+        screen.print(f"Both side by side, in the worst run of {policy}: {beside}", soft_wrap=True)
+
+
+def replay_both(results: Results, folder: Path) -> Path:
+    """The page of both policies side by side: in the cell and with the seed of the second one's worst run."""
+    against, policy = results.plan.policies
+    (chosen,) = headline(results.ordered(), [policy, against], 1)
+    episode = Episode.of_line(chosen.line)
+    records = [record_of(results.plan, episode._replace(policy=one)) for one in (against, policy)]
+    return write_comparison(records, folder / REPLAY)
 
 
 def full_name(policy: str) -> str:
