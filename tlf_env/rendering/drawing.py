@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tlf_env.rendering.looks import Colour
+from tlf_env.rendering.looks import FLOOR as FLOOR
+from tlf_env.rendering.looks import LIGHT, Colour, Theme
 
-FLOOR: Colour = (252, 252, 250)
-INK: Colour = (60, 62, 66)
 SOFT_PX = 0.7  # width of an antialiased edge
 SMOOTH_TURN = 0.9  # cosine of a turn between two lines up to which their ends need no rounding
 BLOCK = 6  # segments of a line with the same colour
@@ -82,14 +81,16 @@ class Shapes:
         The surface to draw on.
     font
         Font of the labels.
+    theme
+        Its colours of text and floor are those of labels.
     """
 
-    def __init__(self, pg: Any, canvas: Any, font: Any) -> None:
-        self._pg, self._canvas, self._font = pg, canvas, font
+    def __init__(self, pg: Any, canvas: Any, font: Any, theme: Theme = LIGHT) -> None:
+        self._pg, self._canvas, self._font, self._theme = pg, canvas, font, theme
 
-    def label(self, text: str, ground: Colour = FLOOR, **anchor: Any) -> None:
+    def label(self, text: str, ground: Colour | None = None, **anchor: Any) -> None:
         """Text on the canvas; ``anchor`` is a point of the text's rectangle, named as in pygame."""
-        image = self._font.render(text, True, INK, ground)
+        image = self._font.render(text, True, self._theme.ink, ground or self._theme.floor)
         self._canvas.blit(image, image.get_rect(**anchor))
 
     def fill(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
