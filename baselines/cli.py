@@ -215,6 +215,13 @@ def run(
         bool, typer.Option("--parquet", help="Write trajectory.parquet, too (needs pyarrow).")
     ] = False,
     mat: Annotated[bool, typer.Option("--mat", help="Write trajectory.mat, too.")] = False,
+    video: Annotated[
+        Path | None, typer.Option(help="Write a video, too: FILE.mp4 or FILE.gif.", metavar="FILE")
+    ] = None,
+    video_fps: Annotated[float, typer.Option(help="Frames per second of the video.")] = 25.0,
+    video_speed: Annotated[
+        float, typer.Option(help="Speed of the video, relative to real time.")
+    ] = 1.0,
     trust: Annotated[bool, TRUST] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json instead of the table.")
@@ -249,6 +256,9 @@ def run(
             mat=mat,
             parquet=parquet,
             as_json=as_json,
+            video=video,
+            video_fps=video_fps,
+            video_speed=video_speed,
         ),
         trust=trust,
     )

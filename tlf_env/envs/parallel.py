@@ -367,9 +367,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         from tlf_env.rendering.scene import scene_of
 
         if self._renderer is None:
-            self._renderer = renderer_of(
-                self._formation, mode=mode, fps=self.metadata["render_fps"]
-            )
+            self._renderer = renderer_of(self._formation, mode=mode)
         return self._renderer.draw(scene_of(self._formation))
 
     def _path_mm(self) -> np.ndarray:

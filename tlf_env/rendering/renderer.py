@@ -94,6 +94,10 @@ class Renderer:
         Number of the robot in the close-up in a corner, at most that of the last robot; None: no close-up.
     theme
         Colours.
+    table
+        Whether time and errors are written in a corner.
+    smallest_text
+        Least size of the text, relative to that in a picture of the usual size.
 
     Attributes
     ----------
@@ -125,6 +129,8 @@ class Renderer:
         courses_mm: Sequence[np.ndarray] = (),
         close_up: int | None = 1,
         theme: Theme = LIGHT,
+        table: bool = True,
+        smallest_text: float = SMALLEST_TEXT,
     ) -> None:
         if mode not in RENDER_MODES:
             raise ValueError(f"mode {mode!r} is not one of {', '.join(RENDER_MODES)}")
@@ -149,7 +155,7 @@ class Renderer:
         self._patches = list(patches)
         self._courses_mm = list(courses_mm)
         self._outlines_mm = [outline_mm(robot) for robot in robots]
-        self._trail_s = trail_s
+        self._trail_s, self._table, self._smallest_text = trail_s, table, smallest_text
         self._close_up = None if close_up is None else min(close_up, len(robots) - 1)
         self._size_px = (0, 0)
         self._view: View  # of the last picture
@@ -261,7 +267,7 @@ class Renderer:
         self._picture = pg.Surface(self._size_px, 0, 32)
         width, height = self._size_px
         self._unit = min(width / DESIGN_SIZE_PX[0], height / DESIGN_SIZE_PX[1])
-        self._text_unit = max(self._unit, SMALLEST_TEXT)
+        self._text_unit = max(self._unit, self._smallest_text)
         self._focus = self._close_up if self._unit >= SMALLEST_CLOSE_UP else None
         self._font, self._time_font, canvas_font = (
             pg.font.Font(None, round(size * self._text_unit))
@@ -288,7 +294,8 @@ class Renderer:
         self._draw_arrows(scene)
         self._draw_close_up(scene)
         self._pg.transform.smoothscale(self._canvas, self._size_px, self._picture)
-        self._write(scene)
+        if self._table:
+            self._write(scene)
         return self._picture
 
     # Memory
@@ -342,7 +349,7 @@ class Renderer:
         scale = min(width / (high[0] - low[0]), height / (high[1] - low[1]))
         pen = OVERSAMPLING * self._unit
         spare = width - (high[0] - low[0]) * scale
-        left = low[0] - max(spare / 2, min(spare, TABLE_PX * pen)) / scale
+        left = low[0] - max(spare / 2, min(spare, TABLE_PX * pen * self._table)) / scale
         top = (low[1] + high[1] + height / scale) / 2
         return View(
             left=0,
@@ -684,21 +691,21 @@ class Renderer:
             self._picture.blit(image, image.get_rect(**{side: (x + column * u, y)}))
 
 
-def renderer_of(formation: Formation, *, mode: str = "rgb_array", **options: Any) -> Renderer:
-    """A renderer for a formation after its reset; ``options`` as of :class:`Renderer`.
-
-    Its frames per second are those of the control steps, if ``options`` do not say otherwise.
-    """
+def stage_of(formation: Formation) -> dict[str, Any]:
+    """What a :class:`Renderer` has to know of a formation after its reset, as keyword arguments; copies."""
     scenario = formation.scenario
-    options.setdefault("fps", 1 / scenario.control_period_s)
-    options.setdefault("patches", patches_of(formation))
-    return Renderer(
-        scenario.robot_models,
-        formation.leader_path(),
-        mode=mode,
-        courses_mm=[thing.corners_mm() for thing in scenario.world.moving],
-        **options,
-    )
+    return {
+        "robots": scenario.robot_models,
+        "path_mm": formation.leader_path().copy(),
+        "fps": 1 / scenario.control_period_s,
+        "patches": patches_of(formation),
+        "courses_mm": [thing.corners_mm() for thing in scenario.world.moving],
+    }
+
+
+def renderer_of(formation: Formation, *, mode: str = "rgb_array", **options: Any) -> Renderer:
+    """A renderer for a formation after its reset; ``options`` as of :class:`Renderer`."""
+    return Renderer(**{**stage_of(formation), "mode": mode, **options})
 
 
 def round_length(least: float) -> float:
