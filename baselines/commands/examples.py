@@ -24,6 +24,14 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "tlf run own.yaml --policy my_module:make": "a task and a policy of your own",
         "tlf run infinity --disturbance slip --video slip.mp4": "a video, too",
     },
+    "view": {
+        "tlf view infinity --disturbance slip": "the default controller on slip; h lists the keys",
+        "tlf view warehouse --policy residual --theme dark": "the learned policy, light on dark",
+    },
+    "play": {
+        "tlf play warehouse": "drive the leader, then: tlf run drive.csv",
+        "tlf play infinity --disturbance ice --robots 5 --out mine.csv": "five robots on ice",
+    },
     "path": {
         "tlf path log.csv --units m --smooth 5": "a noisy log in metres",
         "tlf path log.csv --columns time,px,py --speed-limit 400": "columns by name, at most 400 mm/s",

@@ -34,6 +34,7 @@ WINGS = (
     "runs",
     "paths",
     "data",
+    "live",
     "benchmark",
     "training",
     "tuning",

@@ -41,10 +41,12 @@ class Controls:
     ----------
     pg
         The module pygame.
+    origin_px
+        Where the picture begins in the window.
     """
 
-    def __init__(self, pg: Any) -> None:
-        self._pg = pg
+    def __init__(self, pg: Any, origin_px: tuple[int, int] = (0, 0)) -> None:
+        self._pg, self._origin_px = pg, origin_px
         self.paused = False
         self.steps = 0  # that are still to be done while paused
         self.help = False
@@ -73,18 +75,22 @@ class Controls:
             renderer.camera.zoom_by(ZOOM_STEP**notches, renderer.view, at_mm)
             return True
         if event.type == pg.MOUSEMOTION:
-            self.mouse_px = event.pos
+            self.mouse_px = self.in_picture(event.pos)
             if self._dragging:
                 self._move(renderer, *event.rel)
             return self._dragging
         if event.type == pg.MOUSEBUTTONDOWN:
-            self.mouse_px = event.pos
+            self.mouse_px = self.in_picture(event.pos)
             self._dragging = event.button == LEFT_BUTTON
             return self._dragging
         if event.type == pg.MOUSEBUTTONUP and event.button == LEFT_BUTTON:
             was, self._dragging = self._dragging, False
             return was
         return False
+
+    def in_picture(self, px: tuple[int, int]) -> tuple[int, int]:
+        """A place in the window as one in the picture."""
+        return px[0] - self._origin_px[0], px[1] - self._origin_px[1]
 
     def stop_dragging(self) -> None:
         """End a drag of the view, for example because another control takes the mouse."""

@@ -268,7 +268,7 @@ class Renderer:
         width, height = self._size_px
         self._unit = min(width / DESIGN_SIZE_PX[0], height / DESIGN_SIZE_PX[1])
         self._text_unit = max(self._unit, self._smallest_text)
-        self._focus = self._close_up if self._unit >= SMALLEST_CLOSE_UP else None
+        self._focus: int | None = None
         self._font, self._time_font, canvas_font = (
             pg.font.Font(None, round(size * self._text_unit))
             for size in (TEXT_PX, TIME_PX, TEXT_PX * OVERSAMPLING)
@@ -284,9 +284,9 @@ class Renderer:
     def _paint(self, scene: Scene) -> Any:
         if self._fitted is None:
             self._fitted = self._fit()
-        view = self.camera.view(self._fitted, self._trail[-1][1])
-        if self._background is None or view != self._view:
-            self._view = view
+        view, focus = self.camera.view(self._fitted, self._trail[-1][1]), self._in_close_up()
+        if self._background is None or view != self._view or focus != self._focus:
+            self._view, self._focus = view, focus
             self._background = self._draw_background()
         self._canvas.blit(self._background, (0, 0))
         self._draw_objects(self._view, scene)
@@ -593,6 +593,12 @@ class Renderer:
 
     # Close-up
 
+    def _in_close_up(self) -> int | None:
+        """The robot in the close-up: the one that is followed, or else the usual one."""
+        if self._close_up is None or self._unit < SMALLEST_CLOSE_UP:
+            return None
+        return self._close_up if self.camera.follow is None else self.camera.follow
+
     def _close_up_view(self, number: int, scene: Scene) -> View:
         u, robot = self._unit, self._robots[number]
         side = OVERSAMPLING * round(CLOSE_UP_PX * u)
@@ -648,7 +654,12 @@ class Renderer:
         self._shapes.label("slipping wheel", midleft=(x + 12 * pen, mark.y))
         if len(self._robots) > 1:
             mark = mark.at(0, below)
-            self._shapes.ring(mark, 6 * pen, 1.5 * pen, self._colours[self._focus or 1])
+            self._shapes.ring(
+                mark,
+                6 * pen,
+                1.5 * pen,
+                self._colours[self._focus or min(1, len(self._robots) - 1)],
+            )
             self._shapes.label("predecessor one gap ago", midleft=(x + 12 * pen, mark.y))
 
     # Text
