@@ -20,7 +20,7 @@ from tlf_env.task.warn import without_warnings
 
 WITH_FORCES = ("pymunk", "chipmunk")  # plants on which a push and a patch act while an episode runs
 PUSH_S = 0.2  # duration of a push
-MOST_PUSH_N = 30.0
+MOST_PUSH_N = 8.0  # the motors give about 0.4
 PATCH_RADIUS_MM, PATCH_SCALE = 250.0, 0.1
 MOST_LEVEL = 3.0
 
@@ -155,11 +155,11 @@ class Session:
             on a plant that takes no changes.
         """
         self._check_plant("the level cannot change while it runs")
-        level = min(max(level, 0.0), MOST_LEVEL)
+        level = round(min(max(level, 0.0), MOST_LEVEL), 2)
         disturbance = self.scenario.disturbance
         self.formation.arrays.levels[0] = level
         self._lay_patches()
-        self._note("level", f"level {level:.2g}")
+        self._note("level", f"level {level:g}")
         fixed = [
             channel.path.partition(".")[0]
             for channel in CHANNELS
@@ -184,7 +184,7 @@ class Session:
         self._note("patch", f"{count} patch{'es' * (count > 1)}")
 
     def push(self, robot: int, x_N: float, y_N: float) -> tuple[float, float]:
-        """Push a robot at its centre of mass for 0.2 s with a force of up to 30 N; the force that acts.
+        """Push a robot at its centre of mass for 0.2 s with a force of up to 8 N; the force that acts.
 
         Raises
         ------

@@ -32,9 +32,10 @@ SLIDER_PX, KNOB_PX = 170, 8
 FPS = 60
 MOST_BUSY_S = 0.03  # of a frame, for simulating; a slower computer shows a slower episode
 MESSAGE_S = 6.0
-PUSH_N_PER_MM = 0.03
+PUSH_N_PER_MM = 0.01
 REACH_RADII = 1.5  # of a robot's outline: how near the mouse must be to take it
 LEVEL_STEP = 0.1
+HELD = ("+", "=", "-", ".")  # keys that act again while they are held, beside up and down
 MOST_LINE = 66  # characters beside a name in a list
 
 HAND_KEYS = (
@@ -113,6 +114,7 @@ class LiveWindow:
         self._rate = 1.0  # what is reached of the wanted speed
         self._pushing: int | None = None  # robot that is being pushed with the mouse
         self._sliding = self._shift = False
+        self._down: set[int] = set()  # keys that are held
         self._slider = self.pg.Rect(0, 0, 0, 0)
         self._size_px = size_px
         self._caption = ""
@@ -184,6 +186,8 @@ class LiveWindow:
     def take(self, event: Any) -> None:
         """Take an event of the window, the keys or the mouse."""
         pg = self.pg
+        if self._repeats(event):
+            return
         if event.type == pg.QUIT:
             self.open = False
         elif event.type in (pg.VIDEORESIZE, pg.WINDOWRESIZED, pg.WINDOWSIZECHANGED):
@@ -192,6 +196,8 @@ class LiveWindow:
             self._shift = event.type == pg.KEYDOWN
         elif event.type == pg.WINDOWFOCUSLOST:
             self._shift = False
+        elif event.type == pg.KEYDOWN and event.key == pg.K_F12:
+            self.say(f"picture: {self.save_picture()}")
         elif self.menu is not None:
             self._take_in_menu(event, self.menu)
         elif event.type == pg.KEYDOWN:
@@ -199,6 +205,19 @@ class LiveWindow:
                 self.controls.take(event, self.renderer)
         elif not self._take_mouse(event):
             self.controls.take(event, self.renderer)
+
+    def _repeats(self, event: Any) -> bool:
+        """Whether an event is that of a key which is held and acts only once."""
+        pg = self.pg
+        if event.type == pg.WINDOWFOCUSLOST:
+            self._down.clear()
+        elif event.type == pg.KEYUP:
+            self._down.discard(event.key)
+        elif event.type == pg.KEYDOWN and event.key:
+            held = event.key in self._down
+            self._down.add(event.key)
+            return held and event.key not in (pg.K_UP, pg.K_DOWN) and character(event) not in HELD
+        return False
 
     def take_key(self, event: Any) -> bool:
         """Take a key that is pressed, if it is not one of the view's; whether it was."""
@@ -220,8 +239,6 @@ class LiveWindow:
             case _:
                 if event.key == pg.K_ESCAPE:
                     self.open = False
-                elif event.key == pg.K_F12:
-                    self.say(f"picture: {self.save_picture()}")
                 elif event.key in (pg.K_UP, pg.K_DOWN):
                     step = LEVEL_STEP if event.key == pg.K_UP else -LEVEL_STEP
                     self._set_level(self.session.level + step)
@@ -275,7 +292,7 @@ class LiveWindow:
         return nearest if away[nearest] <= 1.0 else None
 
     def _pull(self, robot: int) -> tuple[float, float]:
-        """The force of the push that the mouse draws, at most 30 N."""
+        """The force of the push that the mouse draws, at most 8 N."""
         x_mm, y_mm = self.renderer.place_mm(self.controls.mouse_px)
         x_N = PUSH_N_PER_MM * (x_mm - float(self.scene.x_mm[robot]))
         y_N = PUSH_N_PER_MM * (y_mm - float(self.scene.y_mm[robot]))
@@ -364,7 +381,7 @@ class LiveWindow:
         fixed: list[str] = []
         if self._attempt(lambda: fixed.extend(session.set_level(level))):
             self.renderer.show_patches(patches_of(session.formation))
-            words = f"level {level:.2g} of {session.scenario.disturbance.name}, at once"
+            words = f"level {level:g} of {session.scenario.disturbance.name}, at once"
             self.say(words + (f"; {', '.join(fixed)}: as at the start" if fixed else ""))
 
     def _slide(self, x_px: int) -> None:
@@ -379,7 +396,7 @@ class LiveWindow:
 
     def _push(self, robot: int, x_N: float, y_N: float) -> None:
         if self._attempt(lambda: self.session.push(robot, x_N, y_N)):
-            self.say(f"robot_{robot} is pushed with {math.hypot(x_N, y_N):.0f} N for 0.2 s")
+            self.say(f"robot_{robot} is pushed with {math.hypot(x_N, y_N):.1f} N for 0.2 s")
 
     def _kick(self) -> None:
         """Push the robot that is followed, or else in the close-up, to its left."""
@@ -450,7 +467,7 @@ class LiveWindow:
         at = [(x, y + HEAD_PX) for x, y in (start, end)]
         self.pg.draw.line(surface, theme.alarm, *at, 3)
         self.pg.draw.circle(surface, theme.alarm, at[1], 5)
-        force = f"{math.hypot(*self._pull(robot)):.0f} N"
+        force = f"{math.hypot(*self._pull(robot)):.1f} N"
         self.overlay.plate(surface, [[force]], bottomleft=(at[1][0] + 8, at[1][1] - 4))
 
     def _draw_head(self, surface: Any) -> None:

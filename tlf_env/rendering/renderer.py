@@ -158,6 +158,7 @@ class Renderer:
         self._trail_s, self._table, self._smallest_text = trail_s, table, smallest_text
         self._close_up = None if close_up is None else min(close_up, len(robots) - 1)
         self._size_px = (0, 0)
+        self._drawn: np.ndarray  # tiles of the canvas that the last picture was drawn on
         self._view: View  # of the last picture
         self.begin(path_mm)
         self._open = True
@@ -288,15 +289,27 @@ class Renderer:
         if self._background is None or view != self._view or focus != self._focus:
             self._view, self._focus = view, focus
             self._background = self._draw_background()
-        self._canvas.blit(self._background, (0, 0))
+            self._drawn = np.ones_like(self._shapes.tiles.take())
+        else:
+            for part in self._shapes.tiles.rectangles(self._drawn):
+                self._canvas.blit(self._background, part[:2], part)
         self._draw_objects(self._view, scene)
         self._draw_robots(self._view, scene)
         self._draw_arrows(scene)
         self._draw_close_up(scene)
-        self._pg.transform.smoothscale(self._canvas, self._size_px, self._picture)
+        self._scale_down()
         if self._table:
             self._write(scene)
         return self._picture
+
+    def _scale_down(self) -> None:
+        """Make the picture of the canvas, where anything was drawn on this one or the one before."""
+        tiles, scale = self._shapes.tiles, self._pg.transform.smoothscale
+        before, self._drawn = self._drawn, tiles.take()
+        for left, top, width, height in tiles.rectangles(before | self._drawn):
+            half = left // OVERSAMPLING, top // OVERSAMPLING, width // OVERSAMPLING
+            part = self._picture.subsurface((*half, height // OVERSAMPLING))
+            scale(self._canvas.subsurface((left, top, width, height)), part.get_size(), part)
 
     # Memory
 
@@ -635,6 +648,7 @@ class Renderer:
             f"robot_{i}", topleft=(view.left + 6 * self._view.pen, view.top + 6 * self._view.pen)
         )
         self._canvas.set_clip(None)
+        self._shapes.tiles.add(self._pg.Rect(view.rect).inflate(4, 4))
         self._pg.draw.rect(
             self._canvas, mixed(self._theme.floor, self._theme.ink, 0.5), view.rect, OVERSAMPLING
         )
@@ -654,12 +668,8 @@ class Renderer:
         self._shapes.label("slipping wheel", midleft=(x + 12 * pen, mark.y))
         if len(self._robots) > 1:
             mark = mark.at(0, below)
-            self._shapes.ring(
-                mark,
-                6 * pen,
-                1.5 * pen,
-                self._colours[self._focus or min(1, len(self._robots) - 1)],
-            )
+            colour = self._colours[self._focus or 1]
+            self._shapes.ring(mark, 6 * pen, 1.5 * pen, colour)
             self._shapes.label("predecessor one gap ago", midleft=(x + 12 * pen, mark.y))
 
     # Text
@@ -672,9 +682,9 @@ class Renderer:
         rows = min(len(self._robots), max(int((bottom - top) / (LINE_PX * u)), 1))
         plate = self._pg.Surface((TABLE_PX * u, top + rows * LINE_PX * u), self._pg.SRCALPHA)
         plate.fill((*self._theme.floor, PLATE_ALPHA))
-        self._picture.blit(plate, (0, 0))
+        self._put(plate, (0, 0))
         time = self._time_font.render(f"t = {scene.t_s:.2f} s", True, self._theme.ink)
-        self._picture.blit(time, (EDGE_PX * u, EDGE_PX * u))
+        self._put(time, (EDGE_PX * u, EDGE_PX * u))
         for i in range(rows):
             self._write_robot(scene, i, top + i * LINE_PX * u)
 
@@ -699,7 +709,15 @@ class Renderer:
                 continue
             colour = self._theme.alarm if column == COLUMNS_PX[-1] else self._theme.ink
             image = self._font.render(text, True, colour)
-            self._picture.blit(image, image.get_rect(**{side: (x + column * u, y)}))
+            self._put(image, image.get_rect(**{side: (x + column * u, y)}))
+
+    def _put(self, image: Any, place: Any) -> None:
+        """An image on the picture, in which the next one replaces it."""
+        rect = self._picture.blit(image, place)
+        scaled = (OVERSAMPLING * side for side in rect)
+        tiles = self._shapes.tiles
+        tiles.add(self._pg.Rect(*scaled))
+        self._drawn |= tiles.take()
 
 
 def stage_of(formation: Formation) -> dict[str, Any]:
