@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run compile test test-slow test-learning check check-install check-lowest check-clients check-pages browser format board speed speed-docs constraints clean
+.PHONY: help run compile test test-slow test-learning check check-install check-lowest check-clients check-pages browser check-live format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -96,6 +96,10 @@ check-clients: ## Run the tests with other libraries, each of CLIENTS in a tempo
 		CLIENT=$$client "$$tmp/bin/python" -m pytest -rs tests/test_clients.py; \
 		rm -rf "$$tmp"; \
 	done
+
+# The live windows under real keys and a real mouse; their pictures stay in results/live.
+check-live: $(VENV)/.stamp-test ## Drive the live windows on a virtual display (needs Xvfb and xdotool)
+	$(BIN)/python tests/live_window.py
 
 format: $(VENV)/.stamp-test ## Sort the imports and format the sources
 	$(BIN)/ruff check --select I --fix

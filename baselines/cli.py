@@ -219,6 +219,13 @@ def run(
         bool, typer.Option("--parquet", help="Write trajectory.parquet, too (needs pyarrow).")
     ] = False,
     mat: Annotated[bool, typer.Option("--mat", help="Write trajectory.mat, too.")] = False,
+    video: Annotated[
+        Path | None, typer.Option(help="Write a video, too: FILE.mp4 or FILE.gif.", metavar="FILE")
+    ] = None,
+    video_fps: Annotated[float, typer.Option(help="Frames per second of the video.")] = 25.0,
+    video_speed: Annotated[
+        float, typer.Option(help="Speed of the video, relative to real time.")
+    ] = 1.0,
     trust: Annotated[bool, TRUST] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json instead of the table.")
@@ -253,6 +260,9 @@ def run(
             mat=mat,
             parquet=parquet,
             as_json=as_json,
+            video=video,
+            video_fps=video_fps,
+            video_speed=video_speed,
         ),
         trust=trust,
     )
@@ -274,6 +284,77 @@ def compare(
 
     writable_folder(out.parent)
     compare_command(folders, out)
+
+
+THEME = typer.Option(help="Colours of the window: light or dark.")
+LIVE_POLICY = typer.Option(
+    help="As of tlf run; the keys p and t switch to others while it runs.",
+    autocompletion=completed("policies"),
+)
+
+
+@app.command(epilog=examples("view"))
+def view(
+    scenario: Annotated[str, SCENARIO],
+    disturbance: Annotated[str | None, DISTURBANCE] = None,
+    level: Annotated[float | None, LEVEL] = None,
+    settings: Annotated[list[str] | None, SETTINGS] = None,
+    policy: Annotated[str, LIVE_POLICY] = "reference",
+    seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
+    robots: Annotated[int | None, typer.Option(help="Number of robots.")] = None,
+    horizon_s: Annotated[float | None, typer.Option(help="Length of the episode, s.")] = None,
+    phase_s: Annotated[
+        float | None,
+        typer.Option(help="Time on its trajectory at which the leader's reference starts, s."),
+    ] = None,
+    theme: Annotated[str, THEME] = "light",
+    trust: Annotated[bool, TRUST] = False,
+) -> None:
+    """Show an episode live in a window: pause, zoom, switch policy, push robots, drop slippery patches."""
+    from baselines.commands.live import view_command
+    from baselines.commands.scenarios import asked_scenario
+
+    fields = {"disturbance": disturbance, "robots": robots, "horizon_s": horizon_s}
+    view_command(
+        asked_scenario(scenario, fields, level, settings or ()),
+        named_policy(policy, None),
+        seed,
+        {} if phase_s is None else {"phase_s": phase_s},
+        theme=theme,
+        trust=trust,
+    )
+
+
+@app.command(epilog=examples("play"))
+def play(
+    scenario: Annotated[str, SCENARIO],
+    disturbance: Annotated[str | None, DISTURBANCE] = None,
+    level: Annotated[float | None, LEVEL] = None,
+    settings: Annotated[list[str] | None, SETTINGS] = None,
+    policy: Annotated[str, LIVE_POLICY] = "reference",
+    seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
+    robots: Annotated[int | None, typer.Option(help="Number of robots.")] = None,
+    horizon_s: Annotated[float, typer.Option(help="The longest drive, s.")] = 600.0,
+    out: Annotated[
+        Path, typer.Option(help="The path that was driven, a CSV file for `tlf run`.")
+    ] = Path("drive.csv"),
+    theme: Annotated[str, THEME] = "light",
+    trust: Annotated[bool, TRUST] = False,
+) -> None:
+    """Drive the leader with arrow keys, W A S D or a gamepad; the others follow. Keeps the path as a file."""
+    from baselines.commands.live import play_command
+    from baselines.commands.scenarios import asked_scenario
+
+    fields = {"disturbance": disturbance, "robots": robots}
+    play_command(
+        asked_scenario(scenario, fields, level, settings or ()),
+        named_policy(policy, None),
+        seed,
+        out,
+        horizon_s=horizon_s,
+        theme=theme,
+        trust=trust,
+    )
 
 
 @app.command("path", epilog=examples("path"))

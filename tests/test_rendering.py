@@ -201,6 +201,28 @@ def test_trails_end_after_their_time() -> None:
     assert trail_pixels(renderer, make_scene(1, 4.0, **moved)) == 0
 
 
+@pytest.mark.parametrize("size_px", [(960, 720), (333, 517), (70, 64)])
+def test_only_what_changes_is_drawn_anew(size_px: tuple[int, int]) -> None:
+    """A picture after others is, px by px, the one that is drawn from an empty canvas."""
+    ghost = {f"ghost_{axis}": np.full(3, 300.0) for axis in ("x_mm", "y_mm", "theta_rad")}
+    scenes = [
+        make_scene(
+            t_s=0.5 * k,
+            x_mm=np.array([2500.0 - 700.0 * k, 100.0 * k**2, -900.0]),
+            y_mm=np.array([60.0 * k, -800.0, 90.0 * k]),
+            lost=np.array([False, k % 2 == 0, False]),
+            touched=np.array([k % 3 == 0, False, False]),
+            objects=(PlacedShape("moving", ((300.0 * k, 1200.0),), 200.0),),
+            **(ghost if k % 2 else {}),
+        )
+        for k in range(8)
+    ]
+    renderer, anew = make_renderer(size_px=size_px), make_renderer(size_px=size_px)
+    for scene in scenes:
+        anew._background = None
+        assert np.array_equal(frame(renderer, scene), frame(anew, scene))
+
+
 def test_long_trails_stay_short_in_memory() -> None:
     renderer = make_renderer(1, trail_s=1.0, size_px=(64, 64))
     for k in range(1000):

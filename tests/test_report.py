@@ -457,7 +457,9 @@ def test_eval_compares_a_file_with_the_default_and_is_resumed(tmp_path, monkeypa
     assert len(list((out / "replays").iterdir())) == 1
     page = (out / "replay.html").read_text("utf-8")
     assert "2 runs: " in page
-    assert page.count('"policy":"still:Still"') == page.count('"policy":"reference:linearised"') == 1
+    assert (
+        page.count('"policy":"still:Still"') == page.count('"policy":"reference:linearised"') == 1
+    )
     (out / "replays" / "of-an-earlier-choice.html").touch()
     before = (out / "runs.jsonl").read_bytes()
     monkeypatch.setattr(sys, "argv", [*words, "--json"])

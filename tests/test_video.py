@@ -1,12 +1,21 @@
-"""The video wrappers of both libraries; they need moviepy, of the extra ``view``."""
+"""Videos of runs, and the video wrappers of both libraries; they need moviepy, of the extra ``view``."""
 
+from __future__ import annotations
+
+import sys
 from pathlib import Path
 
 import gymnasium
+import numpy as np
 import pytest
 from pettingzoo.utils import wrappers
 
 import tlf_env
+from baselines import cli
+from baselines.policies.registry import fit_policy
+from baselines.runs.run import run_policy
+from baselines.runs.video import FORMATS, Film, check_video, status, write_video
+from tlf_env.task.scenario import load_scenario
 
 pytest.importorskip("moviepy")
 
@@ -52,3 +61,135 @@ def test_pettingzoo_records_a_frame_of_the_start_and_of_every_step(tmp_path: Pat
         env.step({agent: 0 * env.action_space(agent).sample() for agent in env.agents})
     env.close()
     assert written(folder) == (STEPS + 1, FPS, (width, height))
+
+
+# --- videos of runs
+
+
+def size_of(path: Path) -> tuple[int, float, tuple[int, int]]:
+    """Frames, frames per second and size (px) of a video."""
+    if path.suffix == ".gif":
+        image = pytest.importorskip("PIL.Image").open(path)
+        durations = []
+        for k in range(image.n_frames):
+            image.seek(k)
+            durations.append(image.info["duration"])
+        return image.n_frames, 1000 * len(durations) / sum(durations), image.size
+    import imageio_ffmpeg
+
+    frames, _ = imageio_ffmpeg.count_frames_and_secs(str(path))
+    reader = imageio_ffmpeg.read_frames(str(path))
+    header = next(reader)
+    reader.close()
+    return frames, header["fps"], tuple(header["size"])
+
+
+def filmed(*policies: str, fps: float = 25.0, speed: float = 1.0, horizon_s: float = 2.0):
+    films, records = [], []
+    for name in policies:
+        fitted = fit_policy(
+            name, load_scenario("infinity", disturbance="slip", horizon_s=horizon_s)
+        )
+        films.append(Film(fps, speed))
+        records.append(run_policy(fitted.scenario, fitted.policy, 0, watch=films[-1]))
+    return films, records
+
+
+@pytest.mark.parametrize("ending", FORMATS)
+def test_a_run_writes_a_video_and_is_otherwise_the_same(
+    ending: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    words = ["run", "infinity", "--disturbance", "slip", "--horizon-s", "2", "--no-figures"]
+    video = tmp_path / "films" / f"run{ending}"
+    cli.app([*words, "--out", str(tmp_path / "plain")], standalone_mode=False)
+    more = ["--video", str(video), "--video-fps", "12.5", "--video-speed", "2"]
+    cli.app([*words, "--out", str(tmp_path / "filmed"), *more], standalone_mode=False)
+    assert str(video) in capsys.readouterr().out.replace("\n", "")
+    frames, fps, size = size_of(video)
+    assert (frames, size) == (13, (960, 720))  # 2 s in 1 s, and the start
+    assert fps == pytest.approx(12.5, rel=0.03)
+    plain, other = (np.load(tmp_path / name / "trajectory.npz") for name in ("plain", "filmed"))
+    assert set(plain.files) == set(other.files)
+    for name in plain.files:
+        assert np.array_equal(plain[name], other[name], equal_nan=plain[name].dtype.kind == "f")
+    assert [path.name for path in video.parent.iterdir()] == [video.name]
+
+
+@pytest.mark.parametrize(("fps", "speed"), [(60.0, 1.0), (25.0, 1.0), (10.0, 4.0), (50.0, 0.5)])
+def test_a_film_has_a_scene_for_every_frame(fps: float, speed: float) -> None:
+    (film,), _ = filmed("reference", fps=fps, speed=speed)
+    wanted_s = np.arange(len(film.scenes)) * speed / fps
+    assert len(film.scenes) == int(2.0 / speed * fps + 1e-9) + 1
+    assert np.abs(wanted_s - [scene.t_s for scene in film.scenes]).max() <= 0.01 + 1e-9
+
+
+def test_films_stand_side_by_side_with_captions(tmp_path: Path) -> None:
+    films, _ = filmed("reference:consistent", "reference", fps=10.0)
+    films[1].scenes = films[1].scenes[:5]  # it keeps its last picture
+    done: list[tuple[int, int]] = []
+    path = write_video(
+        films,
+        tmp_path / "both.mp4",
+        captions=("one", "other"),
+        size_px=(320, 240),
+        theme="dark",
+        progress=lambda *at: done.append(at),
+    )
+    assert size_of(path) == (21, 10.0, (642, 240 + 58))
+    assert done[-1] == (21, 21)
+
+
+def test_the_status_says_how_the_robots_do() -> None:
+    (film,), _ = filmed("reference", horizon_s=0.1)
+    scene = film.scenes[-1]
+    assert status(scene)[1] is False
+    lost = scene._replace(lost=np.array([False, True, True]), touched=np.array([True, True, False]))
+    assert status(lost) == ("robots 1, 2 lost, robot 0 touched", True)
+
+
+@pytest.mark.parametrize(
+    ("more", "message"),
+    [
+        (["--video", "run.avi"], "must end in .mp4 or .gif"),
+        (["--video", "run"], "must end in .mp4 or .gif"),
+        (["--video", "run.mp4", "--video-fps", "0"], "frames per second 0 must be 1 to 100"),
+        (["--video", "run.mp4", "--video-speed", "-1"], "speed -1 must be 0.01 to 100"),
+    ],
+)
+def test_a_video_that_cannot_be_is_refused_in_one_line(
+    more: list[str],
+    message: str,
+    tmp_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr("sys.argv", ["tlf", "run", "infinity", *more])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert stopped.value.code == cli.BAD_INPUT
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    assert message in lines[0]
+    assert not list(tmp_path.iterdir())
+
+
+def test_films_that_do_not_fit_are_refused(tmp_path: Path) -> None:
+    (film,), _ = filmed("reference", horizon_s=0.1)
+    path = tmp_path / "run.mp4"
+    with pytest.raises(ValueError, match="same fps and speed"):
+        write_video([film, Film(10.0)], path)
+    with pytest.raises(ValueError, match="1 films need as many captions, got 2"):
+        write_video([film], path, captions=("a", "b"))
+    with pytest.raises(ValueError, match=r"theme 'drak' is not one of light, dark; did you mean"):
+        write_video([film], path, theme="drak")
+    with pytest.raises(ValueError, match="a film without scenes"):
+        write_video([Film()], path)
+
+
+def test_without_moviepy_a_video_says_what_to_install(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
+    with pytest.raises(ValueError, match=r"pip install 'tlf-env\[view\]'"):
+        check_video(tmp_path / "run.mp4")

@@ -22,6 +22,15 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "tlf run flower --disturbance slip --policy residual": "a learned policy on slip",
         "tlf run infinity --set time_gap_s=3 --seed 7": "any field of the scenario",
         "tlf run own.yaml --policy my_module:make": "a task and a policy of your own",
+        "tlf run infinity --disturbance slip --video slip.mp4": "a video, too",
+    },
+    "view": {
+        "tlf view infinity --disturbance slip": "the default controller on slip; h lists the keys",
+        "tlf view warehouse --policy residual --theme dark": "the learned policy, light on dark",
+    },
+    "play": {
+        "tlf play warehouse": "drive the leader, then: tlf run drive.csv",
+        "tlf play infinity --disturbance ice --robots 5 --out mine.csv": "five robots on ice",
     },
     "compare": {
         "tlf compare results/infinity-consistent-slip-0 results/infinity-residual-slip-0": "two runs of "

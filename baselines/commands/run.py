@@ -45,6 +45,7 @@ from baselines.runs.folders import (
     make_room,
 )
 from baselines.runs.run import Record, run_policy
+from baselines.runs.video import FPS, Film, check_video, write_video
 from baselines.tables import metrics_table
 from tlf_env.common.presets import preset_names
 from tlf_env.numerics.philox import checked_seed
@@ -63,6 +64,9 @@ class Wanted(NamedTuple):
     mat: bool = False
     parquet: bool = False
     as_json: bool = False
+    video: Path | None = None
+    video_fps: float = FPS
+    video_speed: float = 1.0
 
 
 def run_command(
@@ -83,6 +87,7 @@ def run_command(
     """
     checked_seed(seed)
     start_options(options, chosen.robot_count)
+    film = asked_film(wanted)
     fitted = fit_policy(name, chosen, trust=trust)
     if fitted.overrides:
         fields = ", ".join(describe_overrides(fitted.overrides))
@@ -101,16 +106,27 @@ def run_command(
     compile_before_first_run()
     with progress_bar(f"{scenario.name}, {name}") as update:
         record = run_policy(
-            scenario, fitted.policy, seed, name=name, options=options, progress=update
+            scenario,
+            fitted.policy,
+            seed,
+            name=name,
+            options=options,
+            progress=update,
+            watch=film,
         )
     written = write_run(record, folder, identity, wanted)
     if wanted.out is None:
         write_index(RESULTS)
+    if film is not None and wanted.video is not None:
+        with progress_bar("video") as update:
+            write_video([film], wanted.video, progress=update)
     if wanted.as_json:
         typer.echo(json.dumps(summary(record), indent=2, allow_nan=False))
     else:
         screen.print(metrics_table(record))
         screen.print(f"In {folder}: {', '.join(path.name for path in written)}", soft_wrap=True)
+        if wanted.video is not None:
+            screen.print(f"Video: {wanted.video}", soft_wrap=True)
     if record.interrupted:
         notes.print(
             f"tlf: interrupted after {record.t_s[-1]:.6g} s of {scenario.horizon_s:g} s; what was simulated is "
@@ -118,6 +134,21 @@ def run_command(
             soft_wrap=True,
         )
     return not record.interrupted
+
+
+def asked_film(wanted: Wanted) -> Film | None:
+    """What keeps the scenes for the video that is asked for, if any.
+
+    Raises
+    ------
+    ValueError
+        for a video that cannot be written, and for ``video_fps`` and ``video_speed`` out of their range.
+    """
+    if wanted.video is None:
+        return None
+    check_video(wanted.video)
+    writable_folder(wanted.video.parent)
+    return Film(wanted.video_fps, wanted.video_speed)
 
 
 def write_run(record: Record, folder: Path, identity: Identity, wanted: Wanted) -> list[Path]:

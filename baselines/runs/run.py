@@ -137,6 +137,7 @@ def run_policy(
     parts: Mapping[str, Factory] | None = None,
     options: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
+    watch: Callable[[Formation], None] | None = None,
 ) -> Record:
     """Run a policy over the whole horizon, without early ends (``end_on=()``), and record everything.
 
@@ -150,6 +151,9 @@ def run_policy(
         Options of the reset: ``poses`` and ``phase_s``, as of the environments.
     progress
         Called with the steps done and their total.
+    watch
+        Called with the formation at the start and after every control step; it must only read, for example
+        keep scenes for a video (:class:`baselines.runs.video.Film`).
 
     Raises
     ------
@@ -161,13 +165,17 @@ def run_policy(
     formation.reset(checked_seed(seed), start=start_options(options, scenario.robot_count))
     a, steps = formation.arrays, scenario.horizon_steps
     tape, signals = _Tape(a, steps), SignalTape(a, scenario)
-    driver = _Driver(policy, scenario, a, name)
+    driver = PolicyDriver(policy, scenario, a, name)
     objects = [formation.plant.object_poses(0)]
     done = 0
+    if watch is not None:
+        watch(formation)
     try:
         for k in range(1, steps + 1):
             a.actions[:] = driver.act()
             formation.step()
+            if watch is not None:
+                watch(formation)
             objects.append(formation.plant.object_poses(k))
             signals.note(k)
             tape.note(k, scenario.control_period_s)
@@ -210,7 +218,7 @@ def run_seeds(
     plant.reset(list(seeds))
     a, steps = plant.arrays, scenario.horizon_steps
     tape = _Tape(a, steps)
-    driver = _Driver(policy, scenario, a, name)
+    driver = PolicyDriver(policy, scenario, a, name)
     try:
         actions = driver.act()
     except ValueError:
@@ -236,8 +244,20 @@ def seed_blocks(seeds: Sequence[ItemT]) -> Iterator[Sequence[ItemT]]:
         yield seeds[i : i + SEEDS_PER_BLOCK]
 
 
-class _Driver:
-    """A policy and its state during an episode."""
+class PolicyDriver:
+    """A policy and its state during an episode.
+
+    Parameters
+    ----------
+    policy
+        As SB3's ``predict``.
+    scenario
+        Says which observation the policy gets.
+    arrays
+        Of the plant, whose observations are read.
+    name
+        Of the policy, in errors.
+    """
 
     def __init__(self, policy: Policy, scenario: Scenario, arrays: Arrays, name: str) -> None:
         self._policy, self._name = policy, name
@@ -248,7 +268,7 @@ class _Driver:
         self._start = np.ones(self._shape[0] * self._shape[1], dtype=np.bool_)
 
     def act(self) -> np.ndarray:
-        """Actions for all robots of all lanes."""
+        """Actions for all robots of all lanes, ``(lane, robot, 2)``."""
         rows = self._seen.reshape(len(self._start), -1).copy()
         answer = self._policy.predict(rows, self._state, self._start, True)
         shape = (len(rows), self._shape[2])

@@ -35,6 +35,7 @@ WINGS = (
     "pages",
     "paths",
     "data",
+    "live",
     "benchmark",
     "training",
     "tuning",

@@ -16,7 +16,6 @@ from pettingzoo.utils.conversions import parallel_to_aec
 
 from tlf_env.common.errors import shown
 from tlf_env.disturbances.channels import CHANNELS
-from tlf_env.disturbances.model import PatchRow, patch_rows
 from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, state_dtype
 from tlf_env.engine.judging import TERMINATES, TRUNCATES
 from tlf_env.engine.outside_base import separate_base
@@ -364,33 +363,12 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return None if self.render_mode == "human" else self._draw(self.render_mode)
 
     def _draw(self, mode: str) -> np.ndarray | None:
-        from tlf_env.rendering.renderer import Renderer
+        from tlf_env.rendering.renderer import renderer_of
         from tlf_env.rendering.scene import scene_of
 
         if self._renderer is None:
-            self._renderer = Renderer(
-                self.scenario.robot_models,
-                self._path_mm(),
-                mode=mode,
-                fps=self.metadata["render_fps"],
-                patches=[
-                    {
-                        "x_mm": patch.x,
-                        "y_mm": patch.y,
-                        "radius_mm": patch.radius,
-                        "scale": patch.scale,
-                    }
-                    for patch in map(PatchRow._make, self._patches())
-                    if patch.scale != 1  # otherwise the patch has no effect
-                ],
-                courses_mm=[thing.corners_mm() for thing in self.scenario.world.moving],
-            )
+            self._renderer = renderer_of(self._formation, mode=mode)
         return self._renderer.draw(scene_of(self._formation))
-
-    def _patches(self) -> list[list[float]]:
-        scenario = self.scenario
-        rows: list[list[float]] = patch_rows(scenario.disturbance, scenario.world.patches).tolist()
-        return rows
 
     def _path_mm(self) -> np.ndarray:
         return self._formation.leader_path()

@@ -8,10 +8,9 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tlf_env.rendering.looks import Colour
+from tlf_env.rendering.looks import FLOOR as FLOOR
+from tlf_env.rendering.looks import LIGHT, Colour, Theme
 
-FLOOR: Colour = (252, 252, 250)
-INK: Colour = (60, 62, 66)
 SOFT_PX = 0.7  # width of an antialiased edge
 SMOOTH_TURN = 0.9  # cosine of a turn between two lines up to which their ends need no rounding
 BLOCK = 6  # segments of a line with the same colour
@@ -71,6 +70,62 @@ class Place(NamedTuple):
         return Place(x, y, self.theta + turn, self.scale)
 
 
+class Tiles:
+    """Which parts of a canvas have been drawn on: squares of 64 px.
+
+    Parameters
+    ----------
+    size_px
+        Width and height of the canvas.
+    """
+
+    SHIFT = 6  # of a px, to its tile
+
+    def __init__(self, size_px: tuple[int, int]) -> None:
+        self._size_px = size_px
+        width, height = (-(-side >> self.SHIFT) for side in size_px)
+        self.drawn = np.zeros((height, width), dtype=np.bool_)
+
+    def add(self, rect: Any) -> None:
+        """Note that a rectangle (of pygame) has been drawn on."""
+        if rect.width and rect.height:
+            left, right = max(rect.left, 0) >> self.SHIFT, (rect.right - 1) >> self.SHIFT
+            top, bottom = max(rect.top, 0) >> self.SHIFT, (rect.bottom - 1) >> self.SHIFT
+            self.drawn[top : bottom + 1, left : right + 1] = True
+
+    def take(self) -> np.ndarray:
+        """The tiles that were drawn on since the last call, ``(row, column)``."""
+        drawn, self.drawn = self.drawn, np.zeros_like(self.drawn)
+        return drawn
+
+    def rectangles(self, tiles: np.ndarray) -> list[tuple[int, int, int, int]]:
+        """Rectangles of the canvas that cover some tiles, each tile once: left, top, width, height."""
+        found: dict[tuple[int, int], tuple[int, int]] = {}  # of the row before: columns, rows
+        done = []
+        width, height = self._size_px
+        padded = np.zeros((len(tiles), tiles.shape[1] + 2), dtype=np.bool_)
+        padded[:, 1:-1] = tiles
+        runs: list[list[int]] = [[] for _ in range(len(tiles) + 1)]  # of each row: ends of its runs
+        for row, column in np.argwhere(padded[:, 1:] != padded[:, :-1]).tolist():
+            runs[row].append(column)
+        for row, ends in enumerate(runs):
+            now: dict[tuple[int, int], tuple[int, int]] = {}
+            for left, right in zip(ends[::2], ends[1::2], strict=True):
+                first, _ = found.pop((left, right), (row, row))
+                now[left, right] = first, row
+            done += [(*columns, *rows) for columns, rows in found.items()]
+            found = now
+        return [
+            (
+                left << self.SHIFT,
+                top << self.SHIFT,
+                min(right << self.SHIFT, width) - (left << self.SHIFT),
+                min((bottom + 1) << self.SHIFT, height) - (top << self.SHIFT),
+            )
+            for left, right, top, bottom in done
+        ]
+
+
 class Shapes:
     """Draws on a canvas in the px of :class:`View` and :class:`Place`.
 
@@ -82,25 +137,28 @@ class Shapes:
         The surface to draw on.
     font
         Font of the labels.
+    theme
+        Its colours of text and floor are those of labels.
     """
 
-    def __init__(self, pg: Any, canvas: Any, font: Any) -> None:
-        self._pg, self._canvas, self._font = pg, canvas, font
+    def __init__(self, pg: Any, canvas: Any, font: Any, theme: Theme = LIGHT) -> None:
+        self._pg, self._canvas, self._font, self._theme = pg, canvas, font, theme
+        self.tiles = Tiles(canvas.get_size())
 
-    def label(self, text: str, ground: Colour = FLOOR, **anchor: Any) -> None:
+    def label(self, text: str, ground: Colour | None = None, **anchor: Any) -> None:
         """Text on the canvas; ``anchor`` is a point of the text's rectangle, named as in pygame."""
-        image = self._font.render(text, True, INK, ground)
-        self._canvas.blit(image, image.get_rect(**anchor))
+        image = self._font.render(text, True, self._theme.ink, ground or self._theme.floor)
+        self.tiles.add(self._canvas.blit(image, image.get_rect(**anchor)))
 
     def fill(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
         """A polygon, plus half a px since pygame truncates."""
         polygon = [(x + 0.5, y + 0.5) for x, y in points]
-        self._pg.draw.polygon(self._canvas, colour, polygon)
+        self.tiles.add(self._pg.draw.polygon(self._canvas, colour, polygon))
 
     def _smooth(self, points: Sequence[tuple[float, float]], colour: Colour) -> None:
         """A polygon with an antialiased edge, about 0.7 px wide."""
         self.fill(points, colour)
-        self._pg.draw.aalines(self._canvas, colour, True, points)
+        self._edge(points, colour, closed=True)
 
     def bar(self, place: Place, size: tuple[float, float], colour: Colour) -> None:
         """A rectangle around a place with sides along e and f."""
@@ -162,8 +220,13 @@ class Shapes:
             outline = np.concatenate([left[here, i], right[here, i][::-1]]).tolist()
             colour, half = colours[block][i], len(outline) // 2
             self.fill(outline, colour)
-            self._pg.draw.aalines(self._canvas, colour, False, outline[:half])
-            self._pg.draw.aalines(self._canvas, colour, False, outline[half:])
+            self._edge(outline[:half], colour, closed=False)
+            self._edge(outline[half:], colour, closed=False)
+
+    def _edge(self, points: Sequence[Sequence[float]], colour: Colour, *, closed: bool) -> None:
+        """An antialiased line through points."""
+        drawn = self._pg.draw.aalines(self._canvas, colour, closed, points)
+        self.tiles.add(drawn.inflate(2, 2))
 
 
 def clipped(points: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:

@@ -13,50 +13,33 @@ from typing import Any
 import numpy as np
 
 from tlf_env.common.errors import install_command
+from tlf_env.engine.formation import Formation
 from tlf_env.physics.shapes import Kind, PlacedShape
 from tlf_env.physics.vehicle import RobotParameters
-from tlf_env.rendering.drawing import BLOCK, FLOOR, INK, Place, Shapes, View, clipped, mixed
+from tlf_env.rendering.camera import Camera
+from tlf_env.rendering.drawing import BLOCK, Place, Shapes, View, clipped, mixed
+from tlf_env.rendering.looks import ALARM as ALARM
 from tlf_env.rendering.looks import (
     CASTOR_WIDTH_MM,
-    COURSE,
-    CRATE,
-    CRATE_EDGE,
     DRIVE_WHEEL_WIDTH_MM,
-    GRIPPY,
-    MOVER,
-    MOVER_EDGE,
+    LIGHT,
     NOSE,
     RENDER_MODES,
-    SLIPPERY,
-    WALL,
-    WALL_EDGE,
     Colour,
+    Theme,
     front_mm,
     outline_mm,
     robot_colours,
 )
-from tlf_env.rendering.scene import Scene
+from tlf_env.rendering.scene import Scene, patches_of
+from tlf_env.rendering.window import Window
 from tlf_env.task.metrics import touched_name
 
 OVERSAMPLING = 2
 DESIGN_SIZE_PX = (960, 720)  # lengths in px below are for this size and scale with it
 SMALLEST_PX = 64
 
-GRID: Colour = (222, 224, 226)
-HALF_GRID: Colour = (239, 240, 241)
-PATH: Colour = (188, 190, 193)
-TYRE: Colour = (48, 50, 54)
-TREAD: Colour = (205, 208, 212)
-ALARM: Colour = (236, 0, 84)  # slip, lost, touched; no robot has this colour
-
 EDGE_LINE_PX = 1.2  # of what stands fast
-# Inside and edge of what else is in the space, and the width of the edge; None: the floor shows.
-THINGS: dict[Kind, tuple[Colour | None, Colour, float]] = {
-    "loose": (CRATE, CRATE_EDGE, 1.3),
-    "moving": (MOVER, MOVER_EDGE, 2.2),
-    "zone": (None, WALL_EDGE, 1.3),
-    "link": (None, INK, 1.3),
-}
 DASH_PX, COURSE_PX, MOST_DASHES = 7.0, 1.5, 1000
 
 AXLE_MM = 8.0  # in pictures only
@@ -96,7 +79,7 @@ class Renderer:
         nearby, and does not move in an episode; a robot outside is shown as an arrow at the edge.
     mode
         ``"rgb_array"``: frames as arrays, without a display. ``"human"``: a window with at most ``fps``
-        frames per second.
+        frames per second; its keys, which change the view only, are listed by the key h.
     fps
         Frames per second.
     size_px
@@ -109,6 +92,21 @@ class Renderer:
         Paths of moving obstacles, each ``(k, 2)``.
     close_up
         Number of the robot in the close-up in a corner, at most that of the last robot; None: no close-up.
+    theme
+        Colours.
+    table
+        Whether time and errors are written in a corner.
+    smallest_text
+        Least size of the text, relative to that in a picture of the usual size.
+
+    Attributes
+    ----------
+    camera
+        The part of the floor that is shown; the whole at the start.
+    theme
+        Colours.
+    pg
+        The module pygame.
 
     Raises
     ------
@@ -130,27 +128,41 @@ class Renderer:
         patches: Sequence[Mapping[str, float]] = (),
         courses_mm: Sequence[np.ndarray] = (),
         close_up: int | None = 1,
+        theme: Theme = LIGHT,
+        table: bool = True,
+        smallest_text: float = SMALLEST_TEXT,
     ) -> None:
         if mode not in RENDER_MODES:
             raise ValueError(f"mode {mode!r} is not one of {', '.join(RENDER_MODES)}")
         if min(size_px) < SMALLEST_PX:
             raise ValueError(f"size_px {size_px} must be at least {SMALLEST_PX} each way")
-        self._pg = _pygame()
+        self.pg = self._pg = import_pygame()
+        self.theme = self._theme = theme
+        self.camera = Camera()
         self._robots = list(robots)
-        self._colours = robot_colours(len(robots))
+        self._colours = robot_colours(len(robots), theme)
         self._faded = [
-            [mixed(FLOOR, colour, part) for colour in self._colours]
+            [mixed(theme.floor, colour, part) for colour in self._colours]
             for part in np.linspace(0.15, 0.85, 32).tolist()
         ]
+        # Inside and edge of what else is in the space, and the width of the edge; None: the floor shows.
+        self._things: dict[Kind, tuple[Colour | None, Colour, float]] = {
+            "loose": (theme.crate, theme.crate_edge, 1.3),
+            "moving": (theme.mover, theme.mover_edge, 2.2),
+            "zone": (None, theme.wall_edge, 1.3),
+            "link": (None, theme.ink, 1.3),
+        }
         self._patches = list(patches)
         self._courses_mm = list(courses_mm)
         self._outlines_mm = [outline_mm(robot) for robot in robots]
-        self._fps, self._trail_s = fps, trail_s
+        self._trail_s, self._table, self._smallest_text = trail_s, table, smallest_text
         self._close_up = None if close_up is None else min(close_up, len(robots) - 1)
+        self._size_px = (0, 0)
+        self._drawn: np.ndarray  # tiles of the canvas that the last picture was drawn on
+        self._view: View  # of the last picture
         self.begin(path_mm)
-        self._open, self._window = True, mode == "human"
-        if self._window:
-            self._open_window(size_px)
+        self._open = True
+        self._window = Window(self, size_px, fps) if mode == "human" else None
         self._resize(size_px)
 
     def begin(self, path_mm: np.ndarray) -> None:
@@ -174,29 +186,78 @@ class Renderer:
         Returns a new uint8 array ``(H, W, 3)`` in the mode ``"rgb_array"``, else None. Does nothing after
         :meth:`close`.
         """
-        if self._window:
-            self._handle_events()
+        if self._window is not None:
+            self._window.handle_events()
+            self._open = self._open and self._window.open
         if not self._open:
             return None
         self._remember(scene)
-        self._background = self._background or self._draw_background()
-        self._canvas.blit(self._background, (0, 0))
-        self._draw_objects(self._view, scene)
-        self._draw_robots(self._view, scene)
-        self._draw_arrows(scene)
-        self._draw_close_up(scene)
-        self._pg.transform.smoothscale(self._canvas, self._size_px, self._picture)
-        self._write(scene)
-        if self._window:
-            self._show()
+        if self._window is not None:
+            self._window.show(lambda: self._paint(scene))
+            self._open = self._window.open
             return None
+        self._paint(scene)
         return self._pixels()
+
+    def paint(self, scene: Scene) -> Any:
+        """Draw a scene; the picture as a surface of pygame, which the next call overwrites."""
+        self._remember(scene)
+        return self._paint(scene)
 
     def close(self) -> None:
         """Close the window; :meth:`draw` does nothing afterwards."""
-        if self._open and self._window:
-            self._pg.display.quit()
+        if self._open and self._window is not None:
+            self._window.close()
         self._open = False
+
+    # The view
+
+    @property
+    def robots(self) -> int:
+        """Number of robots."""
+        return len(self._robots)
+
+    @property
+    def colours(self) -> list[Colour]:
+        """The robots' colours."""
+        return list(self._colours)
+
+    @property
+    def view(self) -> View:
+        """The view of the last picture, on the canvas, which is twice as large as the picture."""
+        return self._view
+
+    @property
+    def size_px(self) -> tuple[int, int]:
+        """Width and height of the picture."""
+        return self._size_px
+
+    @property
+    def mm_per_px(self) -> float:
+        """Millimetres of floor in a px of the picture."""
+        return OVERSAMPLING / self._view.scale
+
+    def place_mm(self, px: tuple[float, float]) -> tuple[float, float]:
+        """The place on the floor at a px of the last picture."""
+        x_mm, y_mm = self._view.corner_mm
+        return x_mm + px[0] * self.mm_per_px, y_mm - px[1] * self.mm_per_px
+
+    def px_of(self, x_mm: float, y_mm: float) -> tuple[float, float]:
+        """The px of the last picture at a place on the floor."""
+        left_mm, top_mm = self._view.corner_mm
+        return (x_mm - left_mm) / self.mm_per_px, (top_mm - y_mm) / self.mm_per_px
+
+    def show_patches(self, patches: Sequence[Mapping[str, float]]) -> None:
+        """Show other patches of friction from the next picture on."""
+        if list(patches) != self._patches:
+            self._patches, self._background = list(patches), None
+
+    def resize(self, size_px: tuple[int, int]) -> bool:
+        """Draw pictures of another size from now on, if it is not too small; whether anything changed."""
+        if size_px == self._size_px or min(size_px) < SMALLEST_PX:
+            return False
+        self._resize(size_px)
+        return True
 
     # Picture and window
 
@@ -207,13 +268,13 @@ class Renderer:
         self._picture = pg.Surface(self._size_px, 0, 32)
         width, height = self._size_px
         self._unit = min(width / DESIGN_SIZE_PX[0], height / DESIGN_SIZE_PX[1])
-        self._text_unit = max(self._unit, SMALLEST_TEXT)
-        self._focus = self._close_up if self._unit >= SMALLEST_CLOSE_UP else None
+        self._text_unit = max(self._unit, self._smallest_text)
+        self._focus: int | None = None
         self._font, self._time_font, canvas_font = (
             pg.font.Font(None, round(size * self._text_unit))
             for size in (TEXT_PX, TIME_PX, TEXT_PX * OVERSAMPLING)
         )
-        self._shapes = Shapes(pg, self._canvas, canvas_font)
+        self._shapes = Shapes(pg, self._canvas, canvas_font, self._theme)
         self._fitted = self._background = None
 
     def _pixels(self) -> np.ndarray:
@@ -221,27 +282,34 @@ class Renderer:
         data = bytearray(self._pg.image.tobytes(self._picture, "RGB"))
         return np.frombuffer(data, np.uint8).reshape(height, width, 3)
 
-    def _open_window(self, size_px: tuple[int, int]) -> None:
-        self._pg.display.init()
-        self._pg.display.set_mode(size_px, self._pg.RESIZABLE)
-        self._pg.display.set_caption("tlf_env")
-        self._clock = self._pg.time.Clock()
+    def _paint(self, scene: Scene) -> Any:
+        if self._fitted is None:
+            self._fitted = self._fit()
+        view, focus = self.camera.view(self._fitted, self._trail[-1][1]), self._in_close_up()
+        if self._background is None or view != self._view or focus != self._focus:
+            self._view, self._focus = view, focus
+            self._background = self._draw_background()
+            self._drawn = np.ones_like(self._shapes.tiles.take())
+        else:
+            for part in self._shapes.tiles.rectangles(self._drawn):
+                self._canvas.blit(self._background, part[:2], part)
+        self._draw_objects(self._view, scene)
+        self._draw_robots(self._view, scene)
+        self._draw_arrows(scene)
+        self._draw_close_up(scene)
+        self._scale_down()
+        if self._table:
+            self._write(scene)
+        return self._picture
 
-    def _handle_events(self) -> None:
-        if not self._open:
-            return
-        if not self._pg.display.get_init() or self._pg.event.get(self._pg.QUIT):
-            self.close()
-            return
-        self._pg.event.get()
-        size_px = self._pg.display.get_window_size()
-        if size_px != self._size_px and min(size_px) >= SMALLEST_PX:
-            self._resize(size_px)
-
-    def _show(self) -> None:
-        self._pg.display.get_surface().blit(self._picture, (0, 0))
-        self._pg.display.flip()
-        self._clock.tick(self._fps)
+    def _scale_down(self) -> None:
+        """Make the picture of the canvas, where anything was drawn on this one or the one before."""
+        tiles, scale = self._shapes.tiles, self._pg.transform.smoothscale
+        before, self._drawn = self._drawn, tiles.take()
+        for left, top, width, height in tiles.rectangles(before | self._drawn):
+            half = left // OVERSAMPLING, top // OVERSAMPLING, width // OVERSAMPLING
+            part = self._picture.subsurface((*half, height // OVERSAMPLING))
+            scale(self._canvas.subsurface((left, top, width, height)), part.get_size(), part)
 
     # Memory
 
@@ -294,7 +362,7 @@ class Renderer:
         scale = min(width / (high[0] - low[0]), height / (high[1] - low[1]))
         pen = OVERSAMPLING * self._unit
         spare = width - (high[0] - low[0]) * scale
-        left = low[0] - max(spare / 2, min(spare, TABLE_PX * pen)) / scale
+        left = low[0] - max(spare / 2, min(spare, TABLE_PX * pen * self._table)) / scale
         top = (low[1] + high[1] + height / scale) / 2
         return View(
             left=0,
@@ -307,7 +375,6 @@ class Renderer:
         )
 
     def _draw_background(self) -> Any:
-        self._view = self._fitted = self._fitted or self._fit()
         step_mm = round_length(GRID_PX * self._view.pen / self._view.scale)
         self._draw_floor(self._view, step_mm)
         self._draw_scale_bar(self._view, step_mm)
@@ -316,10 +383,10 @@ class Renderer:
         return self._canvas.copy()
 
     def _draw_floor(self, view: View, step_mm: float) -> None:
-        self._canvas.fill(FLOOR, view.rect)
+        self._canvas.fill(self._theme.floor, view.rect)
         for patch in self._patches:
             self._draw_patch(view, patch)
-        for colour, phase in ((HALF_GRID, 0.5), (GRID, 0.0)):
+        for colour, phase in ((self._theme.half_grid, 0.5), (self._theme.grid, 0.0)):
             columns, rows = _grid_lines(view, step_mm, phase)
             for x in columns:
                 self._canvas.fill(colour, (x, view.top, OVERSAMPLING, view.height))
@@ -331,11 +398,11 @@ class Renderer:
         for course_mm in self._courses_mm:
             self._draw_course(view, course_mm)
         width = np.full(len(self._path_mm), PATH_PX * view.pen)
-        self._shapes.lines(view, self._path_mm[:, None], width, [[PATH]] * len(width))
+        self._shapes.lines(view, self._path_mm[:, None], width, [[self._theme.path]] * len(width))
 
     def _draw_patch(self, view: View, patch: Mapping[str, float]) -> None:
         centre = view.place(patch["x_mm"], patch["y_mm"], 0.0)
-        colour = SLIPPERY if patch["scale"] < 1 else GRIPPY
+        colour = self._theme.slippery if patch["scale"] < 1 else self._theme.grippy
         self._shapes.disc(centre, patch["radius_mm"] * view.scale, colour)
         if view is self._view:
             self._shapes.label(f"µ × {patch['scale']:g}", colour, center=(centre.x, centre.y))
@@ -350,7 +417,7 @@ class Renderer:
         places = np.stack([np.interp(ends, ways, axis) for axis in course_mm.T], axis=-1)
         px = view.px(places)
         for dash in px[view.shows(px, 50.0 * view.pen).all(axis=-1)].tolist():
-            self._shapes.stroke(dash, COURSE_PX * view.pen, COURSE)
+            self._shapes.stroke(dash, COURSE_PX * view.pen, self._theme.course)
 
     def _border_px(self, view: View, thing: PlacedShape, room: float) -> np.ndarray:
         """The border of a shape in the space, on the canvas, cut ``room`` outside the window."""
@@ -368,13 +435,13 @@ class Renderer:
         width = 2.0 * EDGE_LINE_PX * view.pen
         points = self._border_px(view, thing, 2.0 * width).tolist()
         if inside and len(points) > 2:
-            self._shapes.fill(points, WALL)
+            self._shapes.fill(points, self._theme.wall)
         elif points and not inside:
-            self._shapes.stroke(points, width, WALL_EDGE)
+            self._shapes.stroke(points, width, self._theme.wall_edge)
 
     def _draw_thing(self, view: View, thing: PlacedShape) -> None:
         """What does not stand fast; what can be pushed has its diagonals marked if it has four corners."""
-        fill, edge, line = THINGS[thing.kind]
+        fill, edge, line = self._things[thing.kind]
         width = line * view.pen
         points = self._border_px(view, thing, 4.0 * width).tolist()
         if not points:
@@ -384,7 +451,7 @@ class Renderer:
         corners = view.px(np.array(thing.corners_mm)) - 0.5
         if thing.kind == "loose" and len(corners) == len(points) == 4:
             for ends in (corners[::2], corners[1::2]):
-                self._shapes.stroke(ends.tolist(), 0.8 * width, mixed(CRATE, edge, 0.5))
+                self._shapes.stroke(ends.tolist(), 0.8 * width, mixed(self._theme.crate, edge, 0.5))
         self._shapes.stroke(points, width, edge)
 
     def _draw_objects(self, view: View, scene: Scene) -> None:
@@ -397,9 +464,9 @@ class Renderer:
         pen, length = self._view.pen, length_mm * view.scale
         right, bottom = view.left + view.width, view.top + view.height
         x, y = right - EDGE_PX * pen - length, bottom - EDGE_PX * pen
-        self._canvas.fill(INK, (x, y - pen, length, 2 * pen))
+        self._canvas.fill(self._theme.ink, (x, y - pen, length, 2 * pen))
         for end in (x, x + length - 2 * pen):
-            self._canvas.fill(INK, (end, y - 4 * pen, 2 * pen, 8 * pen))
+            self._canvas.fill(self._theme.ink, (end, y - 4 * pen, 2 * pen, 8 * pen))
         text = f"{length_mm:g} mm" if length_mm < 1000 else f"{length_mm / 1000:g} m"
         self._shapes.label(text, midbottom=(x + length / 2, y - 4 * pen))
 
@@ -437,7 +504,10 @@ class Renderer:
         robot, colour, pen = self._robots[number], self._colours[number], view.pen
         centre, half = body.at(0, -robot.outline_offset_mm), robot.axle_width_mm / 2
         radius = view.scale * robot.outline_radius_mm
-        fill, edge = mixed(FLOOR, colour, 0.25), mixed(FLOOR, colour, 0.6)
+        fill, edge = (
+            mixed(self._theme.floor, colour, self._theme.body),
+            mixed(self._theme.floor, colour, 0.6),
+        )
         if robot.outline_polygon_mm is None:
             self._shapes.disc(centre, radius + 0.6 * pen, edge)
             self._shapes.disc(centre, radius - 0.6 * pen, fill)
@@ -446,7 +516,9 @@ class Renderer:
             self._shapes.fill(outline, fill)
             self._shapes.stroke(outline, 1.2 * pen, edge)
         self._shapes.bar(
-            body, (2 * half * view.scale, AXLE_MM * view.scale), mixed(FLOOR, colour, 0.6)
+            body,
+            (2 * half * view.scale, AXLE_MM * view.scale),
+            mixed(self._theme.floor, colour, 0.6),
         )
         ahead = front_mm(robot)
         self._shapes.fill(body.px((ahead * e, ahead * f) for e, f in NOSE), colour)
@@ -463,9 +535,11 @@ class Renderer:
             self._draw_tyre(view, wheel, DRIVE_WHEEL_WIDTH_MM, robot.wheel_radius_mm, slip)
             self._draw_treads(wheel, robot.wheel_radius_mm, angle)
         if scene.touched[number]:
-            self._draw_outline(number, body, 2.5 * pen, ALARM)
+            self._draw_outline(number, body, 2.5 * pen, self._theme.alarm)
         if scene.lost[number]:
-            self._shapes.cross(centre.at(0, 0, math.pi / 4), 0.9 * radius, 2.5 * pen, ALARM)
+            self._shapes.cross(
+                centre.at(0, 0, math.pi / 4), 0.9 * radius, 2.5 * pen, self._theme.alarm
+            )
 
     def _draw_outline(self, number: int, body: Place, width: float, colour: Colour) -> None:
         """The line of a robot's outline."""
@@ -486,9 +560,13 @@ class Renderer:
             strength = min(0.45 + 0.55 * slip_mm_s / SLIP_FULL_MM_S, 1.0)
             halo = 4.0 * view.pen
             self._shapes.bar(
-                wheel, (width + halo, length + halo), mixed(FLOOR, ALARM, 0.5 * strength)
+                wheel,
+                (width + halo, length + halo),
+                mixed(self._theme.floor, self._theme.alarm, 0.5 * strength),
             )
-        self._shapes.bar(wheel, (width, length), mixed(TYRE, ALARM, strength))
+        self._shapes.bar(
+            wheel, (width, length), mixed(self._theme.tyre, self._theme.alarm, strength)
+        )
 
     def _draw_treads(self, wheel: Place, radius_mm: float, angle: float) -> None:
         """Foreshortened marks on the upper side of a wheel; they move forward when it rolls."""
@@ -497,7 +575,7 @@ class Renderer:
             if math.cos(turn) > 0.3:
                 thickness = TREAD_RADII * radius_mm * math.cos(turn) * wheel.scale
                 size = DRIVE_WHEEL_WIDTH_MM * wheel.scale, thickness
-                self._shapes.bar(wheel.at(0, radius_mm * math.sin(turn)), size, TREAD)
+                self._shapes.bar(wheel.at(0, radius_mm * math.sin(turn)), size, self._theme.tread)
 
     def _draw_ghost(self, view: View, body: Place, scene: Scene, number: int) -> None:
         """The predecessor's outline one gap ago with a tick at its front, in the follower's colour."""
@@ -510,7 +588,7 @@ class Renderer:
     def _draw_reference(self, view: View, place: Place, scene: Scene, number: int) -> None:
         """A cross with arms along the reference's axes."""
         arm = ARM_RADII * self._robots[number].outline_radius_mm * view.scale
-        self._shapes.cross(place, arm, 1.2 * view.pen, INK)
+        self._shapes.cross(place, arm, 1.2 * view.pen, self._theme.ink)
 
     def _draw_arrows(self, scene: Scene) -> None:
         """An arrow and a name at the edge for every robot outside the view."""
@@ -527,6 +605,12 @@ class Renderer:
             self._shapes.label(f"robot_{i}", center=(middle, name.y))
 
     # Close-up
+
+    def _in_close_up(self) -> int | None:
+        """The robot in the close-up: the one that is followed, or else the usual one."""
+        if self._close_up is None or self._unit < SMALLEST_CLOSE_UP:
+            return None
+        return self._close_up if self.camera.follow is None else self.camera.follow
 
     def _close_up_view(self, number: int, scene: Scene) -> View:
         u, robot = self._unit, self._robots[number]
@@ -564,22 +648,28 @@ class Renderer:
             f"robot_{i}", topleft=(view.left + 6 * self._view.pen, view.top + 6 * self._view.pen)
         )
         self._canvas.set_clip(None)
-        self._pg.draw.rect(self._canvas, mixed(FLOOR, INK, 0.5), view.rect, OVERSAMPLING)
+        self._shapes.tiles.add(self._pg.Rect(view.rect).inflate(4, 4))
+        self._pg.draw.rect(
+            self._canvas, mixed(self._theme.floor, self._theme.ink, 0.5), view.rect, OVERSAMPLING
+        )
 
     def _draw_legend(self) -> None:
         """The legend under the close-up."""
         pen = self._view.pen
         x, y = (EDGE_PX + 8) * pen, self._view.height - (EDGE_PX + 2.3 * LINE_PX) * pen
         mark, below = Place(x, y, 0.0, 1.0), -LINE_PX * pen
-        self._shapes.cross(mark, 6 * pen, 1.3 * pen, INK)
+        self._shapes.cross(mark, 6 * pen, 1.3 * pen, self._theme.ink)
         self._shapes.label("reference", midleft=(x + 12 * pen, y))
         mark = mark.at(0, below)
-        self._shapes.bar(mark, (9 * pen, 14 * pen), mixed(FLOOR, ALARM, 0.5))
-        self._shapes.bar(mark, (5 * pen, 10 * pen), ALARM)
+        self._shapes.bar(
+            mark, (9 * pen, 14 * pen), mixed(self._theme.floor, self._theme.alarm, 0.5)
+        )
+        self._shapes.bar(mark, (5 * pen, 10 * pen), self._theme.alarm)
         self._shapes.label("slipping wheel", midleft=(x + 12 * pen, mark.y))
         if len(self._robots) > 1:
             mark = mark.at(0, below)
-            self._shapes.ring(mark, 6 * pen, 1.5 * pen, self._colours[self._focus or 1])
+            colour = self._colours[self._focus or 1]
+            self._shapes.ring(mark, 6 * pen, 1.5 * pen, colour)
             self._shapes.label("predecessor one gap ago", midleft=(x + 12 * pen, mark.y))
 
     # Text
@@ -591,10 +681,10 @@ class Renderer:
             bottom -= (CLOSE_UP_PX + 4 * LINE_PX) * u
         rows = min(len(self._robots), max(int((bottom - top) / (LINE_PX * u)), 1))
         plate = self._pg.Surface((TABLE_PX * u, top + rows * LINE_PX * u), self._pg.SRCALPHA)
-        plate.fill((*FLOOR, PLATE_ALPHA))
-        self._picture.blit(plate, (0, 0))
-        time = self._time_font.render(f"t = {scene.t_s:.2f} s", True, INK)
-        self._picture.blit(time, (EDGE_PX * u, EDGE_PX * u))
+        plate.fill((*self._theme.floor, PLATE_ALPHA))
+        self._put(plate, (0, 0))
+        time = self._time_font.render(f"t = {scene.t_s:.2f} s", True, self._theme.ink)
+        self._put(time, (EDGE_PX * u, EDGE_PX * u))
         for i in range(rows):
             self._write_robot(scene, i, top + i * LINE_PX * u)
 
@@ -617,8 +707,34 @@ class Renderer:
         for text, column, side in zip(texts, COLUMNS_PX, sides, strict=True):
             if not text:
                 continue
-            image = self._font.render(text, True, ALARM if column == COLUMNS_PX[-1] else INK)
-            self._picture.blit(image, image.get_rect(**{side: (x + column * u, y)}))
+            colour = self._theme.alarm if column == COLUMNS_PX[-1] else self._theme.ink
+            image = self._font.render(text, True, colour)
+            self._put(image, image.get_rect(**{side: (x + column * u, y)}))
+
+    def _put(self, image: Any, place: Any) -> None:
+        """An image on the picture, in which the next one replaces it."""
+        rect = self._picture.blit(image, place)
+        scaled = (OVERSAMPLING * side for side in rect)
+        tiles = self._shapes.tiles
+        tiles.add(self._pg.Rect(*scaled))
+        self._drawn |= tiles.take()
+
+
+def stage_of(formation: Formation) -> dict[str, Any]:
+    """What a :class:`Renderer` has to know of a formation after its reset, as keyword arguments; copies."""
+    scenario = formation.scenario
+    return {
+        "robots": scenario.robot_models,
+        "path_mm": formation.leader_path().copy(),
+        "fps": 1 / scenario.control_period_s,
+        "patches": patches_of(formation),
+        "courses_mm": [thing.corners_mm() for thing in scenario.world.moving],
+    }
+
+
+def renderer_of(formation: Formation, *, mode: str = "rgb_array", **options: Any) -> Renderer:
+    """A renderer for a formation after its reset; ``options`` as of :class:`Renderer`."""
+    return Renderer(**{**stage_of(formation), "mode": mode, **options})
 
 
 def round_length(least: float) -> float:
@@ -645,7 +761,14 @@ def _length_text(length_mm: float) -> str:
     return f"{length_mm:.1f} mm" if length_mm < 1000 else f"{length_mm / 1000:.2f} m"
 
 
-def _pygame() -> Any:
+def import_pygame() -> Any:
+    """The module pygame, with its fonts ready.
+
+    Raises
+    ------
+    ImportError
+        if it is not installed, with the command that installs it.
+    """
     os.environ.setdefault("PYGAME_HIDE_SUPPORT_PROMPT", "1")
     try:
         import pygame

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tlf_env.disturbances.model import PatchRow
 from tlf_env.engine.formation import Formation
 from tlf_env.physics.shapes import PlacedShape
 from tlf_env.task.info import State
@@ -76,6 +77,16 @@ def scene_of(formation: Formation) -> Scene:
             formation.plant.shapes(formation.arrays.rows("motion"), formation.step_count)
         ),
     )
+
+
+def patches_of(formation: Formation) -> list[dict[str, float]]:
+    """The patches of different friction under a formation: ``x_mm``, ``y_mm``, ``radius_mm`` and ``scale``."""
+    rows = formation.arrays.patches[formation.arrays.variants[0]].tolist()
+    return [
+        {"x_mm": patch.x, "y_mm": patch.y, "radius_mm": patch.radius, "scale": patch.scale}
+        for patch in map(PatchRow._make, rows)
+        if patch.scale != 1  # otherwise the patch has no effect
+    ]
 
 
 def _ghosts(formation: Formation, theta: np.ndarray) -> np.ndarray:
