@@ -244,6 +244,24 @@ def test_the_disturbance_is_switched_with_the_mouse() -> None:
     assert window.session.scenario.disturbance.name == "ice"
 
 
+def test_a_long_list_scrolls_in_a_small_window() -> None:
+    policies, disturbances = menus()
+    session = Session(short(), "reference:linearised", 3)
+    window = LiveWindow(session, policies=policies, disturbances=disturbances, size_px=(560, 420))
+    does(window, key("t"))
+    for name in list(disturbances)[list(disturbances).index("slip") :]:
+        assert window.menu is not None
+        shown = window._shown_rows(window.menu)
+        assert name in list(disturbances)[shown.start : shown.stop]
+        assert window._menu_plate.top >= 0
+        assert window._menu_plate.bottom <= 420
+        does(window, key(code=pygame.K_DOWN))
+    does(window, wheel(1))
+    plate = window._menu_plate
+    does(window, pressed((plate.centerx, plate.bottom - 16)))
+    assert window.session.scenario.disturbance.name == list(disturbances)[-1]
+
+
 def test_a_policy_that_does_not_fit_leaves_the_episode_as_it_is() -> None:
     window = opened()
     does(window, elapsed_s=0.5)

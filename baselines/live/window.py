@@ -20,7 +20,7 @@ from tlf_env.rendering.controls import (
 )
 from tlf_env.rendering.drawing import mixed
 from tlf_env.rendering.looks import THEMES
-from tlf_env.rendering.overlay import Overlay
+from tlf_env.rendering.overlay import LINE_PX, Overlay
 from tlf_env.rendering.renderer import Renderer, import_pygame, stage_of
 from tlf_env.rendering.scene import patches_of, scene_of
 
@@ -36,6 +36,7 @@ PUSH_N_PER_MM = 0.01
 REACH_RADII = 1.5  # of a robot's outline: how near the mouse must be to take it
 LEVEL_STEP = 0.1
 HELD = ("+", "=", "-", ".")  # keys that act again while they are held, beside up and down
+MENU_ROOM_PX = 70  # of a list beside its rows
 MOST_LINE = 66  # characters beside a name in a list
 
 HAND_KEYS = (
@@ -324,9 +325,9 @@ class LiveWindow:
         elif event.type == pg.MOUSEBUTTONDOWN and event.button == LEFT_BUTTON:
             row = None
             if self._menu_plate is not None:
-                count = len(menu.lines)
-                row = self.overlay.row_at(self._menu_plate, event.pos, count, title=True)
-            self.menu = None if row is None else menu._replace(at=row)
+                shown = self._shown_rows(menu)
+                row = self.overlay.row_at(self._menu_plate, event.pos, len(shown), title=True)
+            self.menu = None if row is None else menu._replace(at=shown.start + row)
             if self.menu is not None:
                 self._choose(self.menu)
 
@@ -535,14 +536,23 @@ class LiveWindow:
         place = image.get_rect(midright=(slider.left - 16, slider.centery))
         return int(surface.blit(image, place).left)
 
+    def _shown_rows(self, menu: Menu) -> range:
+        """The rows of a list that fit into the window, with the marked one among them."""
+        count = len(menu.lines)
+        fit = min(max((self._size_px[1] - HEAD_PX - BAR_PX - MENU_ROOM_PX) // LINE_PX, 3), count)
+        first = min(max(menu.at - fit // 2, 0), count - fit)
+        return range(first, first + fit)
+
     def _draw_menu(self, surface: Any, menu: Menu) -> None:
-        rows = [(name, shortened(line.replace("`", ""))) for name, line in menu.lines.items()]
+        shown = self._shown_rows(menu)
+        names = list(menu.lines)[shown.start : shown.stop]
+        rows = [(name, shortened(menu.lines[name].replace("`", ""))) for name in names]
         self._menu_plate = self.overlay.plate(
             surface,
             rows,
-            chosen=menu.at,
+            chosen=menu.at - shown.start,
             title=f"{menu.title}: up, down, Enter or click; Esc",
-            center=surface.get_rect().center,
+            center=(surface.get_width() // 2, HEAD_PX + self._picture_size()[1] // 2),
         )
 
 

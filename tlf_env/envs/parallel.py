@@ -57,7 +57,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         :class:`~tlf_env.task.scenario.Scenario`.
     render_mode
         None, ``"rgb_array"`` (:meth:`render` returns frames) or ``"human"`` (a window, updated by every
-        :meth:`reset` and :meth:`step`, at most in real time).
+        :meth:`reset` and :meth:`step`, at most in real time; the key h lists the keys of its view).
     adversary
         Called with the environment before every step; returns ``{channel: value or one per robot}`` to
         apply in that step, e.g. ``{"slip.delta_1_mm_s": 20.0}``.

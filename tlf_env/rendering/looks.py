@@ -78,7 +78,7 @@ class Theme(NamedTuple):
     body: float = (
         0.25  # part of a robot's colour in the inside of its outline, the rest is the floor's
     )
-    first_robot: Colour = (0, 0, 0)  # of up to seven
+    few: tuple[Colour, ...] = FEW_COLOURS  # of up to seven robots
     dark_end: float = (
         0.0  # part of the map of colours, for more robots, that is too close to the floor
     )
@@ -105,7 +105,7 @@ DARK = Theme(
     slippery=(34, 62, 84),
     grippy=(82, 62, 34),
     body=0.35,
-    first_robot=(240, 240, 240),
+    few=((240, 240, 240), (230, 159, 0), (38, 140, 208), (126, 203, 246), *FEW_COLOURS[4:]),
     dark_end=0.2,
     bright_end=1.0,
 )
@@ -122,8 +122,8 @@ def robot_colours(robots: int, theme: Theme = LIGHT) -> list[Colour]:
 
     For up to seven robots each number has a fixed colour; more are spread over viridis, from dark to light.
     """
-    if robots <= len(FEW_COLOURS):
-        return [theme.first_robot, *FEW_COLOURS[1:]][:robots]
+    if robots <= len(theme.few):
+        return list(theme.few[:robots])
     low, high = theme.dark_end, theme.bright_end
     share = np.linspace(0, len(VIRIDIS) - 1, robots)
     along = low * (len(VIRIDIS) - 1) + (high - low) * share

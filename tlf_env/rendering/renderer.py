@@ -399,13 +399,18 @@ class Renderer:
             self._draw_course(view, course_mm)
         width = np.full(len(self._path_mm), PATH_PX * view.pen)
         self._shapes.lines(view, self._path_mm[:, None], width, [[self._theme.path]] * len(width))
+        for patch in self._patches if view is self._view else ():
+            self._label_patch(view, patch)
 
     def _draw_patch(self, view: View, patch: Mapping[str, float]) -> None:
         centre = view.place(patch["x_mm"], patch["y_mm"], 0.0)
         colour = self._theme.slippery if patch["scale"] < 1 else self._theme.grippy
         self._shapes.disc(centre, patch["radius_mm"] * view.scale, colour)
-        if view is self._view:
-            self._shapes.label(f"µ × {patch['scale']:g}", colour, center=(centre.x, centre.y))
+
+    def _label_patch(self, view: View, patch: Mapping[str, float]) -> None:
+        centre = view.place(patch["x_mm"], patch["y_mm"], 0.0)
+        colour = self._theme.slippery if patch["scale"] < 1 else self._theme.grippy
+        self._shapes.label(f"µ × {patch['scale']:g}", colour, center=(centre.x, centre.y))
 
     def _draw_course(self, view: View, course_mm: np.ndarray) -> None:
         """The path of a moving obstacle, dashed."""
