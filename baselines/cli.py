@@ -124,7 +124,9 @@ SETTINGS = typer.Option(
     metavar="PATH=VALUE",
 )
 
-
+VIDEO = typer.Option(help="Write a video, too: FILE.mp4 or FILE.gif.", metavar="FILE")
+VIDEO_FPS = typer.Option(help="Frames per second of the video.")
+VIDEO_SPEED = typer.Option(help="Speed of the video, relative to real time.")
 RAY = typer.Option(help="Address of an existing Ray cluster to run on instead.")
 TRUST = typer.Option(
     "--trust", help="Load SB3 .zip files and run entries' programs: code that they contain."
@@ -219,13 +221,9 @@ def run(
         bool, typer.Option("--parquet", help="Write trajectory.parquet, too (needs pyarrow).")
     ] = False,
     mat: Annotated[bool, typer.Option("--mat", help="Write trajectory.mat, too.")] = False,
-    video: Annotated[
-        Path | None, typer.Option(help="Write a video, too: FILE.mp4 or FILE.gif.", metavar="FILE")
-    ] = None,
-    video_fps: Annotated[float, typer.Option(help="Frames per second of the video.")] = 25.0,
-    video_speed: Annotated[
-        float, typer.Option(help="Speed of the video, relative to real time.")
-    ] = 1.0,
+    video: Annotated[Path | None, VIDEO] = None,
+    video_fps: Annotated[float, VIDEO_FPS] = 25.0,
+    video_speed: Annotated[float, VIDEO_SPEED] = 1.0,
     trust: Annotated[bool, TRUST] = False,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print summary.json instead of the table.")
@@ -278,12 +276,16 @@ def compare(
     out: Annotated[Path, typer.Option(help="The page that is written.")] = Path(
         "results/compare.html"
     ),
+    video: Annotated[Path | None, VIDEO] = None,
+    video_fps: Annotated[float, VIDEO_FPS] = 25.0,
+    video_speed: Annotated[float, VIDEO_SPEED] = 1.0,
 ) -> None:
-    """Show recorded runs side by side: one page with one time line, and what differs."""
-    from baselines.commands.compare import compare_command
+    """Show recorded runs side by side: one page with one time line, a video, and what differs."""
+    from baselines.commands.compare import Filmed, compare_command
 
     writable_folder(out.parent)
-    compare_command(folders, out)
+    film = None if video is None else Filmed(video, video_fps, video_speed)
+    compare_command(folders, out, film)
 
 
 THEME = typer.Option(help="Colours of the window: light or dark.")
@@ -706,11 +708,11 @@ def bench(
             ray_address=ray,
             progress=update,
         )
-    from baselines.commands.bench import Wanted, finish
+    from baselines.commands.bench import BenchFiles, finish
 
     finish(
         results,
-        Wanted(figures=figures, replays=replays, as_json=as_json),
+        BenchFiles(figures=figures, replays=replays, as_json=as_json),
         command_line(sys.argv[1:]),
     )
 
@@ -754,7 +756,7 @@ def eval_(
     from baselines.benchmark.bench import need_tables
 
     need_tables()
-    from baselines.commands.bench import Wanted
+    from baselines.commands.bench import BenchFiles
     from baselines.commands.eval import eval_command
 
     eval_command(
@@ -766,7 +768,7 @@ def eval_(
         overrides={"horizon_s": horizon_s, "plant": plant},
         out=out,
         processes=processes or os.cpu_count() or 1,
-        wanted=Wanted(figures=figures, replays=replays, as_json=as_json),
+        wanted=BenchFiles(figures=figures, replays=replays, as_json=as_json),
         trust=trust,
     )
 

@@ -27,7 +27,7 @@ from baselines.benchmark.comparisons import in_words, only_one_failed
 from baselines.benchmark.notable import Commands, notable, plain
 from baselines.benchmark.plan import Episode, Plan
 from baselines.benchmark.replays import (
-    Wanted,
+    Choice,
     differences,
     file_name,
     headline,
@@ -540,7 +540,7 @@ def test_the_headlines_are_run_once(tmp_path):
         path.write_text("page")
         return path
 
-    made = write_replays(plan, [Wanted(one, "worst"), Wanted(one, "median")], tmp_path, write)
+    made = write_replays(plan, [Choice(one, "worst"), Choice(one, "median")], tmp_path, write)
     assert [replay.what for replay in made] == ["worst", "median"]
     assert len(written) == 1
     assert made[0].file == made[1].file == f"replays/{written[0]}"

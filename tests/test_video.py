@@ -12,7 +12,9 @@ from pettingzoo.utils import wrappers
 
 import tlf_env
 from baselines import cli
+from baselines.commands.run import Wanted, run_command
 from baselines.policies.registry import fit_policy
+from baselines.runs.recorded_film import film_of
 from baselines.runs.run import run_policy
 from baselines.runs.video import FORMATS, Film, check_video, status, write_video
 from tlf_env.task.scenario import load_scenario
@@ -193,3 +195,67 @@ def test_without_moviepy_a_video_says_what_to_install(
     monkeypatch.setitem(sys.modules, "imageio_ffmpeg", None)
     with pytest.raises(ValueError, match=r"pip install 'tlf-env\[view\]'"):
         check_video(tmp_path / "run.mp4")
+
+
+@pytest.mark.parametrize(
+    ("task", "fields"),
+    [
+        ("infinity", {"disturbance": "slip", "time_gap_s": 1.0}),
+        ("warehouse", {}),
+        ("circle", {"robots": 1}),
+    ],
+)
+def test_a_film_of_a_record_is_that_of_the_run(task, fields):
+    fitted = fit_policy("reference", load_scenario(task, horizon_s=2.5, **fields))
+    kept = Film(20.0, 1.5)
+    record = run_policy(fitted.scenario, fitted.policy, 0, watch=kept)
+    made = film_of(record, 20.0, 1.5)
+    assert len(made.scenes) == len(kept.scenes) > 20
+    for found, wanted in zip(made.scenes, kept.scenes, strict=True):
+        for name in found._fields:
+            one, other = getattr(found, name), getattr(wanted, name)
+            if name == "objects":
+                assert sorted(map(str, one)) == sorted(map(str, other)) or same(one, other)
+            else:
+                # angles of wheels are integrals of their recorded speeds
+                room = 0.05 if name.startswith("wheel") else 1e-9
+                assert np.allclose(one, other, rtol=1e-9, atol=room, equal_nan=True), name
+
+
+def same(one, other) -> bool:
+    """Whether two lists of shapes cover the same places."""
+
+    def sums(shapes):
+        return sorted(
+            (one.kind, len(one.corners_mm), *np.round(np.mean(one.corners_mm, axis=0), 6).tolist())
+            for one in shapes
+        )
+
+    return sums(one) == sums(other)
+
+
+def test_recorded_runs_become_one_video(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for policy, out in (("reference", "one"), ("reference:consistent", "other")):
+        chosen = load_scenario("circle", horizon_s=1.0)
+        run_command(chosen, policy, 0, {}, Wanted(out=Path(out), figures=False), trust=False)
+    words = ["tlf", "compare", "one", "other", "--video", "films/both.mp4", "--video-fps", "10"]
+    monkeypatch.setattr(sys, "argv", words)
+    cli.main()
+    assert "Video: films/both.mp4" in capsys.readouterr().out
+    frames, fps, (width, height) = written(tmp_path / "films")
+    assert (frames, fps) == (11, 10.0)
+    assert width > 1.5 * height
+
+
+def test_a_comparison_refuses_a_wrong_video_before_it_writes(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    for more, says in (
+        (["--video", "x.avi"], ".mp4"),
+        (["--video", "x.mp4", "--video-fps", "0"], "frames"),
+    ):
+        monkeypatch.setattr(sys, "argv", ["tlf", "compare", "one", "other", *more])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert ended.value.code == cli.BAD_INPUT
+        assert says in capsys.readouterr().err

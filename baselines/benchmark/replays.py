@@ -22,7 +22,7 @@ LONGEST = 80  # characters of a file's name before its digits
 HASH = 6
 
 
-class Wanted(NamedTuple):
+class Choice(NamedTuple):
     """A run to be replayed."""
 
     line: Line
@@ -38,7 +38,7 @@ class Replay(NamedTuple):
     differences: list[str]  # from the line of runs.jsonl; empty: the same in every digit
 
 
-def headline(lines: Sequence[Line], ranked: Sequence[str], count: int) -> list[Wanted]:
+def headline(lines: Sequence[Line], ranked: Sequence[str], count: int) -> list[Choice]:
     """The runs that say most about the policies, at most ``count``.
 
     For each policy the worst run of the cell in which it fails most (of equals: the one with the largest
@@ -48,14 +48,14 @@ def headline(lines: Sequence[Line], ranked: Sequence[str], count: int) -> list[W
     """
     groups = grouped(lines)
     order = sorted(ranked, key=built_in)
-    found: list[Wanted] = []
-    rest: list[tuple[int, Wanted, Wanted]] = []
+    found: list[Choice] = []
+    rest: list[tuple[int, Choice, Choice]] = []
     for policy in order:
         cells = [(failures(own), notable(own)) for own in groups[policy].values()]
         _, most = max(cells, key=lambda cell: (cell[0], _error(cell[1].worst)))
-        found += [Wanted(most.worst, "worst"), Wanted(cells[0][1].median, "median")]
+        found += [Choice(most.worst, "worst"), Choice(cells[0][1].median, "median")]
         rest += [
-            (count, Wanted(one.worst, "worst"), Wanted(one.median, "median"))
+            (count, Choice(one.worst, "worst"), Choice(one.median, "median"))
             for count, one in cells
         ]
     rest.sort(key=lambda one: -one[0])
@@ -109,7 +109,7 @@ def file_name(line: Line) -> str:
 
 def write_replays(
     plan: Plan,
-    wanted: Sequence[Wanted],
+    wanted: Sequence[Choice],
     folder: Path,
     write: Callable[[Record, Path], Path],
     progress: Callable[[int, int], None] | None = None,

@@ -18,7 +18,7 @@ from baselines.pages.replay import write_replay
 from baselines.tables import board_table
 
 
-class Wanted(NamedTuple):
+class BenchFiles(NamedTuple):
     """What is written and printed."""
 
     figures: bool = True
@@ -26,7 +26,7 @@ class Wanted(NamedTuple):
     as_json: bool = False
 
 
-def finish(results: Results, wanted: Wanted, command: str) -> None:
+def finish(results: Results, wanted: BenchFiles, command: str) -> None:
     """Write the tables, the figures, the replays and the report, and print the leaderboard."""
     board = write_all(results, wanted, command)
     if wanted.as_json:
@@ -37,7 +37,7 @@ def finish(results: Results, wanted: Wanted, command: str) -> None:
 
 
 def write_all(
-    results: Results, wanted: Wanted, command: str, compared: Sequence[Mapping[str, Any]] = ()
+    results: Results, wanted: BenchFiles, command: str, compared: Sequence[Mapping[str, Any]] = ()
 ) -> dict[str, Any]:
     """Write everything into the folder of the results; returns the leaderboard.
 

@@ -4,27 +4,41 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 from rich.box import SIMPLE_HEAD
 from rich.table import Table
 
-from baselines.console import screen
+from baselines.console import progress_bar, screen
 from baselines.pages.differences import differences
 from baselines.pages.replay import write_comparison
 from baselines.runs.files import read_record
+from baselines.runs.recorded_film import film_of
 from baselines.runs.run import Record
+from baselines.runs.video import FPS, Film, check_video, write_video
 from tlf_env.common.errors import path_text
 
 
-def compare_command(folders: Sequence[Path], out: Path) -> list[Record]:
-    """Read the runs of some folders, write the page, and print what differs; the records.
+class Filmed(NamedTuple):
+    """A video that is asked for."""
+
+    path: Path
+    fps: float = FPS
+    speed: float = 1.0
+
+
+def compare_command(folders: Sequence[Path], out: Path, film: Filmed | None = None) -> list[Record]:
+    """Read the runs of some folders, write the page and the video, and print what differs; the records.
 
     Raises
     ------
     ValueError
         for fewer than two folders, more than a page replays, a folder without a finished run, or runs of
-        different tasks or seeds.
+        different tasks or seeds; for a video that cannot be written.
     """
+    if film is not None:
+        check_video(film.path)
+        Film(film.fps, film.speed)  # refuses wrong numbers before anything is read
     if len(folders) < 2:
         raise ValueError("tlf compare needs two runs or more: folders that tlf run has written")
     records = [read_record(folder) for folder in folders]
@@ -42,6 +56,11 @@ def compare_command(folders: Sequence[Path], out: Path) -> list[Record]:
     write_comparison(records, out, names)
     screen.print(difference_table(records, names))
     screen.print(f"Replay of the runs, in a browser: {out}", soft_wrap=True)
+    if film is not None:
+        films = [film_of(record, film.fps, film.speed) for record in records]
+        with progress_bar("video") as update:
+            write_video(films, film.path, captions=names, progress=update)
+        screen.print(f"Video: {film.path}", soft_wrap=True)
     return records
 
 

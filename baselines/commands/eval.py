@@ -21,7 +21,7 @@ from baselines.benchmark.plan import Episode, Plan, disturbance_presets, parse_s
 from baselines.benchmark.replays import headline, record_of
 from baselines.benchmark.results import Results
 from baselines.benchmark.statistics import median
-from baselines.commands.bench import Wanted, print_files, write_all
+from baselines.commands.bench import BenchFiles, print_files, write_all
 from baselines.commands.compile import compile_before_first_run
 from baselines.console import listed, progress_bar, screen, warn_of_scenarios
 from baselines.pages.replay import write_comparison
@@ -43,7 +43,7 @@ def eval_command(
     overrides: Mapping[str, Any],
     out: Path | None,
     processes: int,
-    wanted: Wanted,
+    wanted: BenchFiles,
     trust: bool,
 ) -> None:
     """Run both policies, write the files of a benchmark, and print the comparison.

@@ -56,16 +56,32 @@ class Film:
         self.fps, self.speed = fps, speed
         self.scenes: list[Scene] = []  # one for each frame
         self._stage: dict[str, Any] = {}
+        self._frames = 0  # up to the present step
 
     def __call__(self, formation: Formation) -> None:
         """Keep the present scene if a frame shows it: that of the nearest control step."""
         if not self.scenes:
             self._stage = stage_of(formation)
-        now_s, half_s = formation.time_s, formation.scenario.control_period_s / 2
-        scene = None
-        while len(self.scenes) * self.speed / self.fps < now_s + half_s - 1e-9:
-            scene = scene or scene_of(formation)
-            self.scenes.append(scene)
+        frames = self.frames_at(formation.time_s, formation.scenario.control_period_s)
+        if frames:
+            self.scenes += [scene_of(formation)] * frames
+
+    def frames_at(self, t_s: float, period_s: float) -> int:
+        """How many frames more show the control step at a time, asked for the steps one after the other."""
+        before = self._frames
+        while self._frames * self.speed / self.fps < t_s + period_s / 2 - 1e-9:
+            self._frames += 1
+        return self._frames - before
+
+    def keep(self, scenes: Sequence[Scene], **stage: Any) -> None:
+        """Keep scenes that were recorded before, one for each frame.
+
+        Parameters
+        ----------
+        stage
+            What the renderer has to know, as of :func:`~tlf_env.rendering.renderer.stage_of`.
+        """
+        self.scenes, self._stage = list(scenes), stage
 
     def renderer(self, size_px: tuple[int, int], **options: Any) -> Renderer:
         """What draws the pictures.
