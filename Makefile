@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run compile test test-slow test-learning check check-install check-lowest check-clients check-pages browser check-live format board speed speed-docs constraints clean
+.PHONY: help run compile test test-slow test-learning check check-docs check-install check-lowest check-clients check-pages browser check-live docs format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -101,6 +101,16 @@ check-clients: ## Run the tests with other libraries, each of CLIENTS in a tempo
 check-live: $(VENV)/.stamp-test ## Drive the live windows on a virtual display (needs Xvfb and xdotool)
 	$(BIN)/python tests/live_window.py
 
+# Warnings are errors: a link to a page or heading that is not there, a docstring that cannot be read.
+docs: $(VENV)/.stamp-docs ## Build the documentation site into site/; open site/index.html
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# NOTEBOOKS: names without .ipynb; all by default. What needs BenchMARL is skipped: its requirements exclude others.
+NOTEBOOKS ?=
+check-docs: docs $(VENV)/.stamp-train ## Build the site, check its links, and execute the notebooks
+	$(BIN)/python docs/generate/check_links.py site
+	$(BIN)/python docs/generate/notebook_pages.py --check $(NOTEBOOKS)
+
 format: $(VENV)/.stamp-test ## Sort the imports and format the sources
 	$(BIN)/ruff check --select I --fix
 	$(BIN)/ruff format
@@ -124,7 +134,7 @@ constraints: ## Update constraints.txt from a temporary environment with every e
 	$(PYTHON) -m venv "$$tmp/venv"; \
 	py="$$tmp/venv/bin/python"; \
 	"$$py" -m pip install -q --disable-pip-version-check "torch==$(TORCH)" \
-		build editables hatchling ".[bench,benchmarl,data,dev,figures,mpc,peers,ray,train,tune,view]"; \
+		build editables hatchling ".[bench,benchmarl,data,dev,docs,figures,mpc,peers,ray,train,tune,view]"; \
 	"$$py" -m pip check; \
 	echo "# Versions of everything that the extras install. Made by: make constraints" > "$$tmp/new"; \
 	"$$py" -m pip freeze --all --exclude pip --exclude tlf-env > "$$tmp/frozen"; \
@@ -132,7 +142,7 @@ constraints: ## Update constraints.txt from a temporary environment with every e
 	cp "$$tmp/new" constraints.txt
 
 clean: ## Remove .venv, caches and built packages (results are kept)
-	rm -rf $(VENV) .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist
+	rm -rf $(VENV) .hypothesis .mypy_cache .pytest_cache .ruff_cache build dist site
 	find . -name __pycache__ -type d -prune -exec rm -rf {} +
 
 $(VENV)/.stamp-venv:
@@ -147,6 +157,10 @@ $(VENV)/.stamp-run: $(VENV)/.stamp-venv pyproject.toml constraints.txt
 # mpe2 instead of the extra `peers`, because that also installs vmas and with it torch.
 $(VENV)/.stamp-test: $(VENV)/.stamp-run
 	$(PIP) -c constraints.txt -e ".[bench,data,figures,mpc,tune,view,dev]" mpe2
+	@touch $@
+
+$(VENV)/.stamp-docs: $(VENV)/.stamp-test
+	$(PIP) -c constraints.txt -e ".[docs]"
 	@touch $@
 
 $(VENV)/.stamp-train: $(VENV)/.stamp-test

@@ -34,7 +34,7 @@ PATTERNS = {
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md")])
 SOURCES = sorted(
     path
-    for folder in ("tlf_env", "baselines", "examples", "docs/figures", "tests")
+    for folder in ("tlf_env", "baselines", "examples", "docs/figures", "docs/generate", "tests")
     for path in (ROOT / folder).rglob("*.py")
     if path != Path(__file__).resolve()  # which quotes what it looks for
 )
