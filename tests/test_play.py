@@ -11,7 +11,7 @@ import pytest
 
 from baselines import cli
 from baselines.commands.path import write_path
-from baselines.live.drive import LATERAL_MM_S2, SPEED_MM_S, DriveSession, Hand, HandDrive
+from baselines.live.drive import LATERAL_MM_S2, SPEED_MM_S, DrivenReference, DriveSession, Hand
 from baselines.live.play import PlayWindow
 from baselines.paths.read import read_log
 from baselines.policies.registry import fit_policy
@@ -51,7 +51,7 @@ def driven(**options: Any) -> DriveSession:
 
 @pytest.mark.parametrize("seed", range(5))
 def test_the_reference_moves_like_a_robot_can(seed: int) -> None:
-    random, drive = np.random.default_rng(seed), HandDrive(100.0, -200.0, 0.7)
+    random, drive = np.random.default_rng(seed), DrivenReference(100.0, -200.0, 0.7)
     rows = [drive.reference()]
     for k in range(3000):
         if k % 40 == 0:
@@ -70,7 +70,7 @@ def test_the_reference_moves_like_a_robot_can(seed: int) -> None:
 
 
 def test_directions_are_those_of_the_keys() -> None:
-    drive = HandDrive(0.0, 0.0, 0.0)  # heading along +y
+    drive = DrivenReference(0.0, 0.0, 0.0)  # heading along +y
     drive.hand = Hand(1.0, 0.0)
     for _ in range(100):
         drive.advance(DT_S)

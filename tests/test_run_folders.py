@@ -304,7 +304,7 @@ def test_an_interrupted_record_has_what_was_simulated():
 
 
 def test_ctrl_c_keeps_and_marks_what_was_simulated(monkeypatch, capsys):
-    original = runs._Driver.act
+    original = runs.PolicyDriver.act
     steps = iter(range(10_000))
 
     def act(self):
@@ -312,7 +312,7 @@ def test_ctrl_c_keeps_and_marks_what_was_simulated(monkeypatch, capsys):
             raise KeyboardInterrupt
         return original(self)
 
-    monkeypatch.setattr(runs._Driver, "act", act)
+    monkeypatch.setattr(runs.PolicyDriver, "act", act)
     with pytest.raises(SystemExit) as stopped:
         tlf(monkeypatch, "run", "circle", "--no-figures", "--out", "here")
     assert stopped.value.code == cli.INTERRUPTED
@@ -322,6 +322,6 @@ def test_ctrl_c_keeps_and_marks_what_was_simulated(monkeypatch, capsys):
     assert summary["robots"]["robot_0"]["position_rmse_mm"] is None
     with np.load("here/trajectory.npz") as found:
         assert len(found["t_s"]) == 151
-    monkeypatch.setattr(runs._Driver, "act", original)
+    monkeypatch.setattr(runs.PolicyDriver, "act", original)
     tlf(monkeypatch, "run", "circle", "--no-figures", "--out", "here")  # the same run, whole
     assert json.loads(Path("here/summary.json").read_text(encoding="utf-8"))["simulated_s"] == 100.0

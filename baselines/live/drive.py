@@ -33,7 +33,7 @@ class Hand(NamedTuple):
     left: float = 0.0
 
 
-class HandDrive:
+class DrivenReference:
     """A reference that moves like a robot can: forward only, with bounded accelerations.
 
     Units are mm, s and rad; headings counter-clockwise from +y.
@@ -75,7 +75,7 @@ class HandDrive:
 
     def ahead(self, steps: int, dt_s: float) -> np.ndarray:
         """The reference now and at the next steps if the hand stays, ``(steps, 5)``."""
-        copy = HandDrive(self.x, self.y, self.theta)
+        copy = DrivenReference(self.x, self.y, self.theta)
         copy.speed, copy.yaw_rate, copy.hand = self.speed, self.yaw_rate, self.hand
         rows = []
         for _ in range(steps):
@@ -127,7 +127,7 @@ class DriveSession(Session):
         """As of a session; the drive begins anew."""
         super().restart(**changes)
         x, y, theta = self.formation.arrays.tables[0, 0, :3].tolist()
-        self.drive = HandDrive(x, y, theta)
+        self.drive = DrivenReference(x, y, theta)
         self._every = max(round(SPACING_S / self.scenario.control_period_s), 1)
         self._points = [(0.0, x, y)]
 

@@ -271,6 +271,7 @@ class _Page:
             )
             for film in films
         ]
+        self._painted: list[tuple[Scene, Any] | None] = [None] * len(films)
         self._head = CAPTION_PX if captions else 0
         columns = min(len(films), MOST_COLUMNS)
         rows = math.ceil(len(films) / columns)
@@ -285,7 +286,10 @@ class _Page:
         self._surface.fill(self._theme.path)
         for i, (film, renderer) in enumerate(zip(self._films, self._renderers, strict=True)):
             scene = film.scenes[min(number, len(film.scenes) - 1)]
-            picture = renderer.paint(scene)
+            painted = self._painted[i]
+            if painted is None or painted[0] is not scene:  # otherwise the picture is the same
+                painted = self._painted[i] = scene, renderer.paint(scene)
+            picture = painted[1]
             x, y = self._width * (i % self._columns), self._height * (i // self._columns)
             self._surface.blit(picture, (x, y + self._head))
             if self._captions:

@@ -15,7 +15,7 @@ from tlf_env.task.scenario import load_scenario
 PICTURE = Path(__file__).resolve().parents[1] / "images" / "slip.gif"
 POLICIES = {"reference:consistent": "the paper's loop", "residual": "learned policy"}
 TASK, DISTURBANCE, SEED = "infinity", "slip", 0
-HORIZON_S, SPEED, FPS = 42.0, 3.0, 12.5
+HORIZON_S, SPEED, FPS = 51.0, 3.0, 12.5
 
 
 def main() -> None:
