@@ -401,7 +401,7 @@ def refused(words: list[str], capsys: Any, monkeypatch: Any) -> str:
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["infinit"], "did you mean 'infinity'"),
+        (["infinityx"], "did you mean 'infinity'"),
         (["infinity", "--policy", "residul"], "did you mean 'residual'"),
         (["infinity", "--disturbance", "slp"], "did you mean 'slip'"),
         (

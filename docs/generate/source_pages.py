@@ -62,7 +62,7 @@ def shown(path: PurePosixPath) -> bool:
     if str(path) in PAGES or made_page(path):
         return False
     own = path.parts[:1] == ("docs",)
-    return not own or path.suffix not in (".md", ".png", ".svg", ".ipynb")
+    return not own or path.suffix not in (".md", ".png", ".svg", ".gif", ".ipynb")
 
 
 def page_of(path: PurePosixPath) -> str:

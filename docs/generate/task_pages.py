@@ -12,8 +12,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 from shared import READ, Pages, cells, error, png, policies_of, policy_page, table
 
+from baselines.runs.borders import shape_border
 from baselines.runs.style import tidy
-from baselines.runs.world import colour, shape_border
+from baselines.runs.world import colour
 from tlf_env.common.presets import preset_names, preset_summary, presets_folder
 from tlf_env.physics.shapes import border
 from tlf_env.physics.world import Obstacle, capsules_of
