@@ -46,6 +46,7 @@ def test_the_workflow_runs_every_check() -> None:
         "check-lowest",
         "check-clients",
         "check-pages",
+        "check-paper",
     }
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)

@@ -34,7 +34,9 @@ class Near:
     @property
     def text(self) -> str:
         """The rule in words."""
-        return f"{self.target:g} within {_percent(self.close)}; partly: within {_percent(self.loose)}"
+        return (
+            f"{self.target:g} within {_percent(self.close)}; partly: within {_percent(self.loose)}"
+        )
 
 
 @dataclass(frozen=True)
@@ -74,6 +76,8 @@ class Above:
         """The rule in words."""
         return f"> {self.bound:g}" + ("" if self.loose is None else f"; partly: > {self.loose:g}")
 
+
+NOTHING = 1e-9  # what rounding leaves: it differs between machines
 
 Rule = Near | Below | Above
 
@@ -162,6 +166,8 @@ def shown(value: float, unit: str = "", digits: int = 3) -> str:
         return "not defined"
     if math.isinf(value):
         return "lost" if unit == "mm" else "unbounded"
+    if 0 < abs(value) < NOTHING:
+        return f"< {NOTHING:g}"
     places = max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 0
     text = f"{value:.{places}f}" if places < 7 else f"{value:.{digits - 1}e}"
     return f"{text} {unit}".strip()

@@ -69,8 +69,8 @@ def controller(form: str = "exact") -> Any:
     return 150 + 22 / s + 128 / (s + 2)
 
 
-def joint_friction_Nmm() -> float:
-    """Sliding friction of a drive wheel's joint without side force, by eq. (5): μ_d R_p N."""
+def sliding_friction() -> float:
+    """Sliding friction of a drive wheel's joint without side force, by eq. (5): μ_d R_p N, in N·mm."""
     load_mN = ROBOT.drive_load_share * ROBOT.mass_kg * ROBOT.gravity_mm_s2
     joint = ROBOT.drive_joint
     return joint.mu_dynamic * joint.pin_radius_mm * load_mN / MILLINEWTON_PER_NEWTON
@@ -78,7 +78,7 @@ def joint_friction_Nmm() -> float:
 
 def equivalent_viscosity(swing_rad_s: float = SWING_RAD_S) -> float:
     """Describing function of sliding friction about rest, 4 T_f / (π A): N·mm per rad/s at amplitude A."""
-    return 4 * joint_friction_Nmm() / (math.pi * swing_rad_s)
+    return 4 * sliding_friction() / (math.pi * swing_rad_s)
 
 
 def steepest_fall() -> float:
@@ -92,7 +92,7 @@ def steepest_fall() -> float:
         * (joint.mu_static - joint.mu_dynamic)
         / (joint.dynamic_speed_mm_s - joint.stiction_speed_mm_s)
     )
-    return -fall / joint.mu_dynamic * joint_friction_Nmm() * ROBOT.wheel_radius_mm
+    return -fall / joint.mu_dynamic * sliding_friction() * ROBOT.wheel_radius_mm
 
 
 def plants() -> dict[str, Any]:

@@ -135,7 +135,7 @@ def draw(data: Nyquist) -> Mapping[str, Figure]:
         axes.set_xlabel(r"Re $L$")
         axes.set_ylabel(r"Im $L$")
         tidy(axes)
-        axes.legend(frameon=False, fontsize=9, loc="lower left")
+        axes.legend(frameon=False, fontsize=9, loc="center left", bbox_to_anchor=(0.0, 0.46))
     return {"fig7c": figure}
 
 
@@ -186,7 +186,9 @@ def tables(data: Nyquist) -> tuple[Table, ...]:
                 f"{one.predicted:.3f}",
             )
         )
-    return (Table("Experiments with a pseudo-random binary reference, 60 s each", head, tuple(rows)),)
+    return (
+        Table("Experiments with a pseudo-random binary reference, 60 s each", head, tuple(rows)),
+    )
 
 
 def _nearest(data: Nyquist) -> Measured:
@@ -212,7 +214,8 @@ def _friction(data: Nyquist) -> Measured:
     k = int(np.argmin(np.abs(1 + rest.L)))
     return Measured(
         abs(rolling.margin - without.margin),
-        f"about rest the wheels stick: the estimate is {rest.margin:.2f} with a coherence of {rest.coherence[k]:.2f}",
+        f"about rest the wheels stick: the estimate is {rest.margin:.2f} with a coherence of "
+        f"{rest.coherence[k]:.2f}",
     )
 
 
@@ -267,21 +270,22 @@ PART = Part(
     name="fig7c",
     title="Fig. 7(c): the experiment on the wheel loop",
     text=(
-        "Both wheels of a robot that goes straight on at 300 mm/s receive a reference with a pseudo-random binary "
-        "sequence of one sample per bit; the digital K(z) of the project acts on the plant of the project, with its "
-        "friction. L is the ratio of the cross spectra of output and reference and of error and reference, by "
-        "averages of segments (Welch). The circles hold the value of L with 95 %.",
-        "Not published, and chosen here: the period of K(z) and its delay, the amplitude and the mean of the "
-        "reference, and the noise of the speed (1 mrad/s). Period and delay decide the margin. With an amplitude of "
-        "0.02 rad/s the torque stays inside ±15 N·mm. With 0.1 rad/s and more it is at its limit for half of the "
-        "time, and the estimate is of a saturated loop: a smaller L and a margin that looks larger. About rest the "
-        "wheels stick, and the data say nothing about L.",
+        "Both wheels of a robot that goes straight on at 300 mm/s receive a reference with a "
+        "pseudo-random binary sequence of one sample per bit; the digital K(z) of the project acts on the "
+        "plant of the project, with its friction. L is the ratio of the cross spectra of output and "
+        "reference and of error and reference, by averages of segments (Welch). The circles hold the "
+        "value of L with 95 %.",
+        "Not published, and chosen here: the period of K(z) and its delay, the amplitude and the mean of "
+        "the reference, and the noise of the speed (1 mrad/s). Period and delay decide the margin. With "
+        "an amplitude of 0.02 rad/s the torque stays inside ±15 N·mm. With 0.1 rad/s and more it is at "
+        "its limit for half of the time, and the estimate is of a saturated loop: a smaller L and a "
+        "margin that looks larger. About rest the wheels stick, and the data say nothing about L.",
     ),
     compute=compute,
     draw=draw,
     captions={
-        "fig7c": "Fig. 7(c): Nyquist plots from the experiments, with the 95 % regions of some points. Left: dead "
-        "times. Right: amplitude and friction. Dashed circle: the reported margin."
+        "fig7c": "Fig. 7(c): Nyquist plots from the experiments, with the 95 % regions of some points. "
+        "Left: dead times. Right: amplitude and friction. Dashed circle: the reported margin."
     },
     tables=tables,
     claims=CLAIMS,

@@ -41,6 +41,8 @@ class Part:
         The tables of the data.
     claims
         The claims that the data decide.
+    drives
+        Whether it needs the compiled step drivers.
     """
 
     name: str
@@ -51,3 +53,4 @@ class Part:
     captions: Mapping[str, str]
     tables: Callable[[Any], tuple[Table, ...]]
     claims: tuple[Claim, ...]
+    drives: bool = False

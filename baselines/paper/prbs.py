@@ -21,7 +21,9 @@ LIMIT_NMM = 15.0  # footnote 4
 REGISTER = 16  # bits of the shift register: a period of 65 535 samples
 SEGMENT = 1024  # samples of a segment, with a Hann window and half overlap
 FIRST_BIN = 6  # below, the window's leakage from the slow part dominates
-OVERLAP_VARIANCE = 1.056  # of a mean of Hann segments that overlap by half, over that of separate ones
+OVERLAP_VARIANCE = (
+    1.056  # of a mean of Hann segments that overlap by half, over that of separate ones
+)
 CONFIDENCE = 0.95
 
 
@@ -128,14 +130,10 @@ def estimate(data: Data, period_s: float) -> Estimate:
     n = len(R)
     variance = OVERLAP_VARIANCE * n / (n - 1) * scatter / np.abs(cross_e) ** 2
     radius = np.sqrt(-math.log(1 - CONFIDENCE) * variance)
-    coherence = np.abs(cross_y) ** 2 / (
-        (np.abs(Y) ** 2).sum(axis=0) * (np.abs(R) ** 2).sum(axis=0)
-    )
+    coherence = np.abs(cross_y) ** 2 / ((np.abs(Y) ** 2).sum(axis=0) * (np.abs(R) ** 2).sum(axis=0))
     omega = 2 * np.pi * np.arange(FIRST_BIN, SEGMENT // 2 + 1) / (SEGMENT * period_s)
     k = int(np.argmin(np.abs(1 + L)))
-    return Estimate(
-        omega, L, radius, coherence, float(np.abs(1 + L[k])), float(radius[k])
-    )
+    return Estimate(omega, L, radius, coherence, float(np.abs(1 + L[k])), float(radius[k]))
 
 
 def predicted_loop(period_s: float, delay: int, kappa: float, omega: np.ndarray) -> np.ndarray:

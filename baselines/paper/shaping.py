@@ -10,7 +10,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from baselines.paper.claims import Above, Below, Claim, Measured, Near, shown
-from baselines.paper.look import BLACK, BLUE, GREEN, ORANGE, RED, new_figure
+from baselines.paper.look import BLACK, BLUE, GREEN, RED, new_figure
 from baselines.paper.loop import (
     KAPPA,
     LOOP,
@@ -19,12 +19,11 @@ from baselines.paper.loop import (
     Conditions,
     conditions,
     controller,
-    joint_friction_Nmm,
     kappa_of,
     last_crossing,
     open_loop,
     plants,
-    supremum,
+    sliding_friction,
     weight_error,
     weight_uncertainty,
 )
@@ -114,7 +113,9 @@ def shapes(data: Shaping) -> Figure:
         axes.axhline(1, color="0.45", lw=0.8)
         axes.plot(crossover, 1, "o", color=BLUE, ms=5, label=f"crossover {shown(crossover)} rad/s")
         limit = data.frequencies["W_δ"]
-        axes.axvline(limit, color="0.45", lw=0.8, ls=":", label=f"$|W_\\delta|=1$ at {limit:.3g} rad/s")
+        axes.axvline(
+            limit, color="0.45", lw=0.8, ls=":", label=f"$|W_\\delta|=1$ at {limit:.3g} rad/s"
+        )
         axes.set_xlim(1e-3, 1e4)
         axes.set_ylim(1e-4, 1e5)
         axes.set_xlabel("frequency (rad/s)")
@@ -223,10 +224,10 @@ def _uncertainty(data: Shaping) -> Measured:
 
 
 def _error_to_move(_: Shaping) -> Measured:
-    error = joint_friction_Nmm() / (LOOP.gain_Nmm_s * UNITS["design"])
+    error = sliding_friction() / (LOOP.gain_Nmm_s * UNITS["design"])
     return Measured(
         error,
-        f"{joint_friction_Nmm():.2f} N·mm of sliding friction in a wheel's joint against a gain of "
+        f"{sliding_friction():.2f} N·mm of sliding friction in a wheel's joint against a gain of "
         f"{LOOP.gain_Nmm_s * UNITS['design']:g} N·mm per rad/s",
     )
 
@@ -241,7 +242,6 @@ def _running_crossover(data: Shaping) -> Measured:
     crossover = data.found["eq. (6)", "running", "exact"].crossover_rad_s
     limit = data.frequencies["W_δ"]
     return Measured(crossover / limit, f"crossover {crossover:.4g} rad/s, limit {limit:.3g} rad/s")
-
 
 
 CLAIMS = (
@@ -408,15 +408,16 @@ PART = Part(
     name="fig7ab",
     title="Fig. 7(a) and (b): loop shaping of the wheel loop",
     text=(
-        "The paper prints K(s) without a unit. Its frequencies follow with K in kg·mm²/s² per rad/s (the design "
-        "loop). That loop gives 0.15 N·mm for an error of 1 rad/s and does not move the robot. With K in N·mm per "
-        "rad/s (the running loop) it does, and the loop is 1000 times as fast.",
-        "Plants: eq. (6); the common and the differential mode of our robot at 300 mm/s, from its linearisation, with "
-        "castor and yaw inertia; each of them with friction linearised about rest, by the describing function "
-        "4 T_f/(πA) at an amplitude of A = 1 rad/s; and eq. (6) at the steepest fall of joint friction with speed, "
-        "between the transition speeds of Table I. Sliding friction at a steady speed is constant: an input "
-        "disturbance, with no part in the linear plant. The trail, the yaw inertia and the place of the centre of "
-        "mass are not published; they decide the differential mode.",
+        "The paper prints K(s) without a unit. Its frequencies follow with K in kg·mm²/s² per rad/s (the "
+        "design loop). That loop gives 0.15 N·mm for an error of 1 rad/s and does not move the robot. "
+        "With K in N·mm per rad/s (the running loop) it does, and the loop is 1000 times as fast.",
+        "Plants: eq. (6); the common and the differential mode of our robot at 300 mm/s, from its "
+        "linearisation, with castor and yaw inertia; each of them with friction linearised about rest, by "
+        "the describing function 4 T_f/(πA) at an amplitude of A = 1 rad/s; and eq. (6) at the steepest "
+        "fall of joint friction with speed, between the transition speeds of Table I. Sliding friction at "
+        "a steady speed is constant: an input disturbance, with no part in the linear plant. The trail, "
+        "the yaw inertia and the place of the centre of mass are not published; they decide the "
+        "differential mode.",
     ),
     compute=compute,
     draw=draw,

@@ -39,6 +39,7 @@ WINGS = (
     "training",
     "tuning",
     "speed",
+    "paper",
 )
 
 
