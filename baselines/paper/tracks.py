@@ -470,9 +470,9 @@ PART = Part(
     title="Fig. 11: both simulations",
     text=(
         "∞ with three robots for 100 s, and the flower with five for 150 s, gap 5 s, seed 0, with the "
-        "paper's EKF at 1 ms and noise of 0.2 mm² of the position fixes. Plants: kinematic (no masses, no "
-        "friction, no slip); dynamic without the bending moment of the castor's steering joint; complete. "
-        "Robots do not collide with each other in these runs.",
+        "paper's EKF at 1 ms and noise of 0.2 mm² of the position fixes. Robot 1 leads, as in the paper. "
+        "Plants: kinematic (no masses, no friction, no slip); dynamic without the bending moment of the "
+        "castor's steering joint; complete. Robots do not collide with each other in these runs.",
         "Not published, and chosen here: the control period (the figures have 1 ms, the shortest; the "
         "tables have 20 ms, too), the start poses (300 mm apart behind the leader on the tangent, at "
         "rest), the castor's trail, radius and place, the yaw inertia and the centre of mass. “Adequate” "
