@@ -104,8 +104,14 @@ def test_numbers_are_shown_with_their_digits():
     assert shown(1319.3, "mm") == "1319 mm"
     assert shown(math.inf, "mm") == "lost"
     assert shown(math.nan) == "not defined"
-    assert shown(3e-12) == "< 1e-09"
+    assert shown(3e-12, "mm") == "< 1e-9 mm"
     assert shown(0.0) == "0"
+
+
+def test_rules_are_written_with_the_unit():
+    assert Below(50, 100).text("%") == "< 50 %; partly: < 100 %"
+    assert Above(0).text("1/s") == "> 0 1/s"
+    assert Near(0.81, 0.03, 0.1).text() == "0.81 within 3 %; partly: within 10 %"
 
 
 def test_claims_are_many_and_have_names_of_their_own():
@@ -412,6 +418,17 @@ def test_a_lost_robot_has_no_finite_error(consistent_20_ms):
     assert lost.worst_mm == math.inf
     assert tracks.result(lost) == "1 of 3 lost"
     assert consistent_20_ms.worst_mm == consistent_20_ms.rms_mm.max()
+
+
+def test_an_interrupted_run_is_no_result():
+    """A run that is interrupted returns what it has; its numbers would be of a shorter run."""
+
+    def stop(done: int, _: int) -> None:
+        if done == 5:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        formations.run(formations.Key("infinity", "complete", "consistent", 0.02), stop)
 
 
 def test_the_plants_of_the_runs():

@@ -31,9 +31,8 @@ class Near:
             return Verdict.NOT
         return _graded(abs(value - self.target), self.close, self.loose, abs(self.target))
 
-    @property
-    def text(self) -> str:
-        """The rule in words."""
+    def text(self, unit: str = "") -> str:
+        """The rule in words, for a number with a unit."""
         return (
             f"{self.target:g} within {_percent(self.close)}; partly: within {_percent(self.loose)}"
         )
@@ -52,10 +51,10 @@ class Below:
             return Verdict.REPRODUCED
         return Verdict.PARTLY if self.loose is not None and value < self.loose else Verdict.NOT
 
-    @property
-    def text(self) -> str:
-        """The rule in words."""
-        return f"< {self.bound:g}" + ("" if self.loose is None else f"; partly: < {self.loose:g}")
+    def text(self, unit: str = "") -> str:
+        """The rule in words, for a number with a unit."""
+        bounds = (self.bound,) if self.loose is None else (self.bound, self.loose)
+        return "; partly: ".join(f"< {bound:g} {unit}".strip() for bound in bounds)
 
 
 @dataclass(frozen=True)
@@ -71,10 +70,10 @@ class Above:
             return Verdict.REPRODUCED
         return Verdict.PARTLY if self.loose is not None and value > self.loose else Verdict.NOT
 
-    @property
-    def text(self) -> str:
-        """The rule in words."""
-        return f"> {self.bound:g}" + ("" if self.loose is None else f"; partly: > {self.loose:g}")
+    def text(self, unit: str = "") -> str:
+        """The rule in words, for a number with a unit."""
+        bounds = (self.bound,) if self.loose is None else (self.bound, self.loose)
+        return "; partly: ".join(f"> {bound:g} {unit}".strip() for bound in bounds)
 
 
 NOTHING = 1e-9  # what rounding leaves: it differs between machines
@@ -153,7 +152,7 @@ def judge(claim: Claim, data: Any, command: str) -> Finding:
         reported=claim.reported,
         quantity=claim.quantity,
         computed=shown(value, claim.unit, claim.digits) + (f" ({detail})" if detail else ""),
-        rule=claim.rule.text,
+        rule=claim.rule.text(claim.unit),
         verdict=str(claim.rule.verdict(value)),
         figure=claim.figure,
         command=command,
@@ -167,7 +166,7 @@ def shown(value: float, unit: str = "", digits: int = 3) -> str:
     if math.isinf(value):
         return "lost" if unit == "mm" else "unbounded"
     if 0 < abs(value) < NOTHING:
-        return f"< {NOTHING:g}"
+        return f"< 1e-9 {unit}".strip()
     places = max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 0
     text = f"{value:.{places}f}" if places < 7 else f"{value:.{digits - 1}e}"
     return f"{text} {unit}".strip()

@@ -83,9 +83,18 @@ def scenario_of(key: Key) -> Scenario:
 
 
 def run(key: Key, progress: Callable[[int, int], None] | None = None) -> Outcome:
-    """Drive a run to its horizon, seed 0, with the paper's filter."""
+    """Drive a run to its horizon, seed 0, with the paper's filter.
+
+    Raises
+    ------
+    KeyboardInterrupt
+        for a run that was interrupted.
+    """
     fitted = fit_policy(f"reference:{key.gains}", scenario_of(key))
-    return outcome(run_policy(fitted.scenario, fitted.policy, 0, progress=progress))
+    record = run_policy(fitted.scenario, fitted.policy, 0, progress=progress)
+    if record.interrupted:
+        raise KeyboardInterrupt
+    return outcome(record)
 
 
 def outcome(record: Record) -> Outcome:

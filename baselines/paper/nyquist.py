@@ -16,7 +16,7 @@ from baselines.paper.look import COLOURS, DASHES, new_figure
 from baselines.paper.loop import conditions, kappa_of, plants
 from baselines.paper.parts import Part, Progress, Table
 from baselines.paper.prbs import (
-    Estimate,
+    LoopEstimate,
     Trial,
     estimate,
     predicted_loop,
@@ -50,7 +50,7 @@ class Experiment(NamedTuple):
     """A trial and what came of it."""
 
     trial: Trial
-    found: Estimate
+    found: LoopEstimate
     saturated: float
     predicted: float  # modulus margin of the linear loop
 
@@ -139,7 +139,7 @@ def draw(data: Nyquist) -> Mapping[str, Figure]:
     return {"fig7c": figure}
 
 
-def points(axes: Axes, found: Estimate, colour: str, label: str, marker: str) -> None:
+def points(axes: Axes, found: LoopEstimate, colour: str, label: str, marker: str) -> None:
     """Points of an estimate at some frequencies, with the circles of its confidence region."""
     bins = np.unique(np.round(np.geomspace(1, len(found.L), SHOWN_POINTS)).astype(int)) - 1
     axes.plot(
@@ -153,7 +153,7 @@ def points(axes: Axes, found: Estimate, colour: str, label: str, marker: str) ->
     axes.add_collection(PatchCollection(circles, fc=colour, ec="none", alpha=0.18, zorder=2))
 
 
-def margin_text(found: Estimate) -> str:
+def margin_text(found: LoopEstimate) -> str:
     """A modulus margin with the radius of its confidence region."""
     return f"{found.margin:.2f} ± {found.margin_radius:.2f}"
 

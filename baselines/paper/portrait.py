@@ -213,7 +213,7 @@ def _shares(preset: str, within_s: float) -> Any:
         }
         return Measured(
             min(shares.values()),
-            ", ".join(f"{name} {value:.0f} %" for name, value in shares.items()),
+            ", ".join(f"{name} {value:.1f} %" for name, value in shares.items()),
         )
 
     return measure

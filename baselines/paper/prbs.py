@@ -49,7 +49,7 @@ class Data(NamedTuple):
     saturated: float  # share of the samples with the torque at its limit
 
 
-class Estimate(NamedTuple):
+class LoopEstimate(NamedTuple):
     """The loop by frequency, with its confidence region: circles in the plane of L."""
 
     omega: np.ndarray  # rad/s
@@ -108,7 +108,7 @@ def run_trial(trial: Trial, seed: int = 0) -> Data:
     )
 
 
-def estimate(data: Data, period_s: float) -> Estimate:
+def estimate(data: Data, period_s: float) -> LoopEstimate:
     """L = Φ_yr/Φ_er by averages over segments; r is the reference, e the error and y the output.
 
     The reference as an instrument keeps the estimate free of bias from the noise in e and y. The scatter of
@@ -133,7 +133,7 @@ def estimate(data: Data, period_s: float) -> Estimate:
     coherence = np.abs(cross_y) ** 2 / ((np.abs(Y) ** 2).sum(axis=0) * (np.abs(R) ** 2).sum(axis=0))
     omega = 2 * np.pi * np.arange(FIRST_BIN, SEGMENT // 2 + 1) / (SEGMENT * period_s)
     k = int(np.argmin(np.abs(1 + L)))
-    return Estimate(omega, L, radius, coherence, float(np.abs(1 + L[k])), float(radius[k]))
+    return LoopEstimate(omega, L, radius, coherence, float(np.abs(1 + L[k])), float(radius[k]))
 
 
 def predicted_loop(period_s: float, delay: int, kappa: float, omega: np.ndarray) -> np.ndarray:
