@@ -164,7 +164,7 @@ def shown(value: float, unit: str = "", digits: int = 3) -> str:
     if math.isnan(value):
         return "not defined"
     if math.isinf(value):
-        return "lost" if unit == "mm" else "unbounded"
+        return "lost"
     if 0 < abs(value) < NOTHING:
         return f"< 1e-9 {unit}".strip()
     places = max(0, digits - 1 - math.floor(math.log10(abs(value)))) if value else 0

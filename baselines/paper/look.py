@@ -21,7 +21,7 @@ BLUE, ORANGE, GREEN, RED, PURPLE, BLACK = (
 )
 COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, BLACK)
 DASHES: tuple[Any, ...] = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (1, 1)))
-DPI = 110  # the figures are part of a page
+DPI = 96  # the figures are part of a page
 
 
 def new_figure(width_in: float, height_in: float) -> Figure:
@@ -36,7 +36,12 @@ def write(figures: Mapping[str, Figure], folder: Path) -> list[Path]:
         path = folder / f"{name}.png"
         with atomic(path, "wb") as file:
             figure.savefig(
-                file, format="png", dpi=DPI, facecolor="white", metadata=METADATA.get("png")
+                file,
+                format="png",
+                dpi=DPI,
+                facecolor="white",
+                metadata=METADATA.get("png"),
+                pil_kwargs={"optimize": True},
             )
         written.append(path)
     return written

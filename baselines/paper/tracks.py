@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from matplotlib.figure import Figure
 
-from baselines.paper.claims import Above, Below, Claim, Measured
+from baselines.paper.claims import Above, Below, Claim, Measured, shown
 from baselines.paper.formations import (
     GAINS,
     PERIODS_S,
@@ -154,19 +154,19 @@ def tables(data: Tracks) -> tuple[Table, ...]:
         rows.append(
             (
                 ", ".join(name),
-                cells(np.where(one.lost, np.inf, one.rms_mm), "lost"),
-                cells(np.where(one.lost, np.inf, one.gap_rms_s)[1:], "lost"),
-                cells(one.heading_rms_rad, "–"),
-                f"{one.distance_mm[0]:.0f} to {one.distance_mm[1]:.0f}",
+                cells(one.rms_mm, one.lost),
+                cells(one.gap_rms_s[1:], one.lost[1:]),
+                cells(one.heading_rms_rad, one.lost),
+                "–" if one.lost.any() else f"{one.distance_mm[0]:.0f} to {one.distance_mm[1]:.0f}",
             )
         )
         others.append(
             (
                 ", ".join(name),
-                cells(one.J_mm_s[-1], "–"),
-                cells(one.absolute_J_mm_s[-1], "–"),
-                cells(one.J_theta_rad_s[-1], "–"),
-                cells(one.absolute_J_theta_rad_s[-1], "–"),
+                cells(one.J_mm_s[-1], one.lost),
+                cells(one.absolute_J_mm_s[-1], one.lost),
+                cells(one.J_theta_rad_s[-1], one.lost),
+                cells(one.absolute_J_theta_rad_s[-1], one.lost),
             )
         )
     return (
@@ -197,9 +197,13 @@ def tables(data: Tracks) -> tuple[Table, ...]:
     )
 
 
-def cells(values: np.ndarray, infinite: str) -> str:
-    """Numbers of the robots with two significant digits."""
-    return " / ".join(_two(float(value)) if np.isfinite(value) else infinite for value in values)
+def cells(values: np.ndarray, lost: np.ndarray | None = None) -> str:
+    """Numbers of the robots with two significant digits; those of a lost robot say nothing."""
+    gone = np.zeros(len(values), dtype=bool) if lost is None else lost
+    return " / ".join(
+        "lost" if is_lost else _two(float(value))
+        for value, is_lost in zip(values, gone, strict=True)
+    )
 
 
 def _two(value: float) -> str:
@@ -212,7 +216,7 @@ def _two(value: float) -> str:
 def _worst(task: str, plant: str, gains: str) -> Any:
     def measure(data: Tracks) -> Measured:
         one = data.at(task, plant, gains)
-        return Measured(one.worst_mm, cells(np.where(one.lost, np.inf, one.rms_mm), "lost"))
+        return Measured(one.worst_mm, cells(one.rms_mm, one.lost))
 
     return measure
 
@@ -236,7 +240,7 @@ def _after_20_s(task: str, gains: str) -> Any:
         ratios = one.late_rms_mm / one.early_rms_mm
         return Measured(
             math.inf if one.lost.any() else float(ratios.max()),
-            "each robot: " + cells(ratios, "–"),
+            "each robot: " + cells(ratios),
         )
 
     return measure
@@ -289,12 +293,13 @@ def _cancels(data: Tracks) -> Measured:
 
 def _heading(gains: str) -> Any:
     def measure(data: Tracks) -> Measured:
-        worst = {
-            task: float(data.at(task, "complete", gains).heading_rms_rad.max()) for task in TASKS
-        }
+        worst = {}
+        for task, name in TASKS.items():
+            one = data.at(task, "complete", gains)
+            worst[name] = math.inf if one.lost.any() else float(one.heading_rms_rad.max())
         return Measured(
             max(worst.values()),
-            ", ".join(f"{TASKS[task]} {value:.2g} rad" for task, value in worst.items()),
+            ", ".join(f"{name} {shown(value, 'rad', 2)}" for name, value in worst.items()),
         )
 
     return measure
