@@ -255,6 +255,19 @@ def test_the_margin_without_delay_has_a_closed_form():
         assert prbs.predicted_margin(period_s, 0, KAPPA) == pytest.approx(expected, abs=2e-3)
 
 
+def test_an_unstable_loop_has_no_margin():
+    """At 10 ms with a sample of delay, and beyond the closed-form limit 150 κT < 2 without delay."""
+    assert math.isnan(prbs.predicted_margin(0.010, 1, KAPPA))
+    assert prbs.is_stable(0.001, 0, 1.9 * 1000 / 150)
+    assert not prbs.is_stable(0.001, 0, 2.1 * 1000 / 150)
+
+
+def test_the_margin_falls_with_kappa():
+    for dead_time in nyquist.DEAD_TIMES.values():
+        largest = prbs.predicted_margin(*dead_time, 1.5 * KAPPA)
+        assert nyquist.spread(*dead_time) == pytest.approx(largest, abs=0.02)
+
+
 @pytest.mark.parametrize(("period_s", "delay"), [(0.001, 0), (0.002, 1)])
 def test_a_short_experiment_has_the_margin_of_the_linear_loop(period_s, delay):
     trial = prbs.Trial(period_s=period_s, delay=delay, duration_s=20.0)
@@ -413,6 +426,23 @@ def test_functionals_are_the_integrals_of_the_errors(consistent_20_ms):
     assert np.all(mean <= math.sqrt(2) * whole * 1.001)
 
 
+def test_every_run_is_driven_with_its_progress(consistent_20_ms, monkeypatch):
+    key = formations.Key("infinity", "complete", "consistent", 0.02)
+    monkeypatch.setattr(tracks, "every_key", lambda: [key, key._replace(gains="printed")])
+
+    def run(_, progress):
+        progress(1, 2)
+        progress(2, 2)
+        return consistent_20_ms
+
+    monkeypatch.setattr(tracks, "run", run)
+    calls = []
+    data = tracks.compute(lambda *call: calls.append(call))
+    assert data.at("infinity", "complete", "consistent", 0.02) is consistent_20_ms
+    assert [call[:2] for call in calls] == [(50, 200), (100, 200), (150, 200), (200, 200)]
+    assert calls[-1][2] == "∞, complete, printed, 20 ms"
+
+
 def test_a_lost_robot_has_no_finite_error(consistent_20_ms):
     lost = consistent_20_ms._replace(lost=np.array([False, True, False]))
     assert lost.worst_mm == math.inf
@@ -462,7 +492,7 @@ def test_a_part_of_the_page_is_computed_anew(name, tmp_path):
 def test_an_experiment_of_the_page_is_run_anew():
     period_s, delay = nyquist.DEAD_TIMES["1 ms, two samples"]
     one = nyquist.experiment(prbs.Trial(period_s=period_s, delay=delay), 0.6166520734)
-    made = nyquist.Nyquist({"1 ms, two samples": one}, {}, 0.6166520734, 0.0)
+    made = nyquist.Nyquist({"1 ms, two samples": one}, {}, 0.6166520734, 0.0, {})
     (row,) = nyquist.tables(made)[0].rows
     assert row in committed()["fig7c"].tables[0].rows
 

@@ -146,5 +146,21 @@ def predicted_loop(period_s: float, delay: int, kappa: float, omega: np.ndarray)
 
 def predicted_margin(period_s: float, delay: int, kappa: float) -> float:
     """Smallest |1 + L| up to the Nyquist frequency; NaN if the closed loop is unstable."""
+    if not is_stable(period_s, delay, kappa):
+        return math.nan
     omega = np.linspace(1e-4, np.pi, 40_001) / period_s
     return float(np.abs(1 + predicted_loop(period_s, delay, kappa, omega)).min())
+
+
+def is_stable(period_s: float, delay: int, kappa: float) -> bool:
+    """Whether all poles of the closed loop of :func:`predicted_loop` lie within the unit circle."""
+    loop = digital_wheel_loop(WheelLoopParameters(), period_s)
+    decay = loop.lag_decay
+    numerator = (
+        loop.gain * np.poly([1, decay])
+        + loop.integral_step * np.poly([0, decay])
+        + loop.lag_step * np.poly([0, 1])
+    )
+    denominator = np.poly([1, 1, decay] + [0] * delay)
+    whole = np.polyadd(numerator * kappa * period_s / MILLINEWTON_PER_NEWTON, denominator)
+    return bool(np.abs(np.roots(whole)).max() < 1)
