@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run compile test test-slow test-learning check check-docs check-install check-lowest check-clients check-pages browser check-live docs format board speed speed-docs constraints clean
+.PHONY: help run compile test test-slow test-learning check check-docs check-install check-lowest check-clients check-pages check-paper browser check-live docs format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -50,6 +50,9 @@ check: $(VENV)/.stamp-test ## Lint, check format and types
 check-pages: $(VENV)/.stamp-test browser ## Test the pages of HTML in a headless Chromium
 	$(BIN)/python -m pip install -q --disable-pip-version-check -c constraints.txt -e ".[browser]"
 	TLF_BROWSER=needed $(BIN)/pytest tests/browser
+
+check-paper: $(VENV)/.stamp-test ## Compute all figures and claims of the paper anew, and compare them with docs/paper.md
+	$(BIN)/pytest -m "slow or not slow" tests/test_paper.py
 
 browser: ## Install Chromium and its driver, if there are none (Debian's packages, as root)
 	@(command -v chromium || command -v google-chrome) >/dev/null && command -v chromedriver >/dev/null || \

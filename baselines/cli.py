@@ -969,6 +969,30 @@ def tune(
     screen.print(f"tlf run {search.tasks[0]} {how}", soft_wrap=True)
 
 
+@app.command("paper", epilog=examples("paper"))
+def paper(
+    figures: Annotated[
+        str,
+        typer.Option(
+            help="fig7ab, fig7c, fig8, proofs and fig11, comma-separated; or all. What the folder has of the "
+            "others stays on its page."
+        ),
+    ] = "all",
+    out: Annotated[Path, typer.Option(help="Folder of the page and the figures.")] = Path(
+        "results/paper"
+    ),
+    as_json: Annotated[
+        bool, typer.Option("--json", help="Print paper.json instead of the table.")
+    ] = False,
+) -> None:
+    """Compute the paper's figures and claims anew; write a page with a verdict on each claim."""
+    try:
+        from baselines.commands.paper import paper_command
+    except ModuleNotFoundError as error:
+        raise ValueError(f"tlf paper needs {error.name} ({install_command('figures')})") from error
+    paper_command(None if figures == "all" else listed(figures), out, as_json=as_json)
+
+
 @app.command("compile", epilog=examples("compile"))
 def compile_(
     everything: Annotated[

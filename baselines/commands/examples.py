@@ -66,6 +66,10 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "tlf train own.yaml --robot-steps 200000": "a training of your own, shorter",
     },
     "tune": {"tlf tune adrc --trials 50": "a search of the gains; call it again to continue"},
+    "paper": {
+        "tlf paper": "every figure and claim of the paper, into results/paper; some ten minutes",
+        "tlf paper --figures fig7ab,fig7c": "the wheel loop only, half a minute",
+    },
     "compile": {
         "tlf compile": "what most runs need",
         "tlf compile --all": "also for tlf speed and double precision",

@@ -40,6 +40,7 @@ WINGS = (
     "training",
     "tuning",
     "speed",
+    "paper",
 )
 
 
