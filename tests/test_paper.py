@@ -111,6 +111,7 @@ def test_numbers_are_shown_with_their_digits():
 def test_rules_are_written_with_the_unit():
     assert Below(50, 100).text("%") == "< 50 %; partly: < 100 %"
     assert Above(0).text("1/s") == "> 0 1/s"
+    assert Below(1e-9).text() == "< 1e-9"
     assert Near(0.81, 0.03, 0.1).text() == "0.81 within 3 %; partly: within 10 %"
 
 
