@@ -22,6 +22,7 @@ pytest.importorskip("matplotlib")
 from baselines import cli
 from baselines.paper import (
     errors,
+    follower,
     formations,
     loop,
     nyquist,
@@ -111,6 +112,7 @@ def test_numbers_are_shown_with_their_digits():
 def test_rules_are_written_with_the_unit():
     assert Below(50, 100).text("%") == "< 50 %; partly: < 100 %"
     assert Above(0).text("1/s") == "> 0 1/s"
+    assert Below(1e-9).text() == "< 1e-9"
     assert Near(0.81, 0.03, 0.1).text() == "0.81 within 3 %; partly: within 10 %"
 
 
@@ -395,6 +397,39 @@ def test_numbers_of_the_proofs():
     assert data.bound == pytest.approx(k * data.bound_at_mm**2 - data.gains.epsilon / 4)
 
 
+# --- the observer
+
+
+def test_the_observers_error_is_that_of_eqs_45_to_47():
+    """In the body frame, by an adaptive solver; the start's heading error is below π."""
+    t_s = np.arange(2001) * follower.STEP_S
+    u_1, u_2 = follower.TWIST
+
+    def rates_45(_, z, b):
+        return [
+            -z[1] * u_2 + u_1 * (1 - math.cos(z[2])) - b * z[0],
+            z[0] * u_2 - u_1 * math.sin(z[2]) - b * z[1],
+            -b * z[2],
+        ]
+
+    e_x, e_y, e_theta = follower.START
+    start = [e_y, e_x, e_theta]  # the predecessor faces +y at first: forward is y, right is x
+    for b in follower.GAINS_PER_S:
+        z = solve_ivp(rates_45, (0, 2), start, args=(b,), t_eval=t_s, rtol=1e-9, atol=1e-9).y
+        found = follower.distance(t_s, b)
+        np.testing.assert_allclose(found, np.hypot(z[0], z[1]), atol=3.0)
+
+
+def test_the_peak_without_smoothing_is_b_times_the_spacing():
+    t_s = np.arange(5001) * follower.STEP_S
+    without, smooth = (follower.reference_speed(t_s, seconds) for seconds in (0, 5.0))
+    assert without.max() == without[0] == pytest.approx(3 * follower.BEHIND_MM)
+    # ẏ = ℘ b (d − y) has the solution d (1 − exp(−b ∫℘)).
+    share = 0.5 * (1 - np.cos(np.pi * t_s / 5))
+    area = 0.5 * (t_s - 5 / np.pi * np.sin(np.pi * t_s / 5))
+    np.testing.assert_allclose(smooth, 3 * share * follower.BEHIND_MM * np.exp(-3 * area), atol=1.0)
+
+
 # --- the simulations
 
 
@@ -484,7 +519,7 @@ def assert_same(name: str, fresh: Result) -> None:
     assert kept.figures == fresh.figures
 
 
-@pytest.mark.parametrize("name", ["fig7ab", "proofs"])
+@pytest.mark.parametrize("name", ["fig7ab", "observer", "proofs"])
 def test_a_part_of_the_page_is_computed_anew(name, tmp_path):
     assert_same(name, make(PARTS[name], tmp_path, no_progress))
 

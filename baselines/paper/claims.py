@@ -54,7 +54,7 @@ class Below:
     def text(self, unit: str = "") -> str:
         """The rule in words, for a number with a unit."""
         bounds = (self.bound,) if self.loose is None else (self.bound, self.loose)
-        return "; partly: ".join(f"< {bound:g} {unit}".strip() for bound in bounds)
+        return "; partly: ".join(f"< {_number(bound)} {unit}".strip() for bound in bounds)
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ class Above:
     def text(self, unit: str = "") -> str:
         """The rule in words, for a number with a unit."""
         bounds = (self.bound,) if self.loose is None else (self.bound, self.loose)
-        return "; partly: ".join(f"> {bound:g} {unit}".strip() for bound in bounds)
+        return "; partly: ".join(f"> {_number(bound)} {unit}".strip() for bound in bounds)
 
 
 NOTHING = 1e-9  # what rounding leaves: it differs between machines
@@ -176,6 +176,10 @@ def _graded(distance: float, close: float, loose: float, scale: float) -> Verdic
     if distance <= close * scale:
         return Verdict.REPRODUCED
     return Verdict.PARTLY if distance <= loose * scale else Verdict.NOT
+
+
+def _number(value: float) -> str:
+    return f"{value:g}".replace("e-0", "e-")
 
 
 def _percent(share: float) -> str:

@@ -22,10 +22,9 @@ INTRODUCTION = (
     "that damps the heading.",
 )
 OPEN = (
-    "Not examined here: the robustness against κ ± 50 % and against the number of robots, the scaling of "
-    "the ultimate bound with ε and η and with slip, the consistency of the EKF and its behaviour under "
-    "skid, the observer's decay against b and the peaking that ℘ removes, and the sensitivity to the "
-    "unpublished parameters.",
+    "Not examined here: the robustness of whole formations against κ ± 50 % and against the number of "
+    "robots, the scaling of the ultimate bound with ε and η and with slip, the consistency of the EKF and "
+    "its behaviour under skid, and the sensitivity to the unpublished parameters.",
 )
 HEAD = ("claim", "paper", "computed", "rule", "verdict", "figure")
 CLASSES = {Verdict.REPRODUCED: "good", Verdict.PARTLY: "part", Verdict.NOT: "bad"}

@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from baselines.paper import nyquist, portrait, proofs, shaping, tracks
+from baselines.paper import follower, nyquist, portrait, proofs, shaping, tracks
 from baselines.paper.claims import Finding, judge
 from baselines.paper.look import write
 from baselines.paper.parts import Part, Progress, Table
@@ -15,7 +15,8 @@ from tlf_env.common.errors import suggestion
 from tlf_env.common.files import atomic, read_json
 
 PARTS: dict[str, Part] = {
-    module.PART.name: module.PART for module in (shaping, nyquist, portrait, proofs, tracks)
+    module.PART.name: module.PART
+    for module in (shaping, nyquist, portrait, follower, proofs, tracks)
 }
 FILE = "paper.json"
 
