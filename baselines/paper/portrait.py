@@ -12,6 +12,7 @@ from baselines.paper.claims import Above, Below, Claim, Measured
 from baselines.paper.errors import (
     REFERENCES,
     Converged,
+    Law,
     Paths,
     convergence,
     growth_rates,
@@ -56,6 +57,14 @@ def grid() -> np.ndarray:
     return np.stack([one.ravel() for one in np.meshgrid(E_1_MM, E_2_MM, E_3_RAD, indexing="ij")])
 
 
+def rates_of(law: Law) -> tuple[float, float, float]:
+    """Largest real parts of the eigenvalues about e₃ = 0, π and 2π, 1/s."""
+    about_0, about_pi, about_2_pi = (
+        float(growth_rates(e_3, law).real.max()) for e_3 in (0.0, np.pi, 2 * np.pi)
+    )
+    return about_0, about_pi, about_2_pi
+
+
 def compute(progress: Progress) -> Portrait:
     """Paths for 60 s and maps for 100 s."""
     every_law = laws()
@@ -71,15 +80,12 @@ def compute(progress: Progress) -> Portrait:
             maps[name, reference] = convergence(grid(), law, twist, MAPPED_S)
             done += 1
             progress(done, total)
-    rates = {
-        name: tuple(float(growth_rates(e_3, law).real.max()) for e_3 in (0.0, np.pi, 2 * np.pi))
-        for name, law in every_law.items()
-    }
+    rates = {name: rates_of(law) for name, law in every_law.items()}
     left_mm = {
         name: float(convergence(SMALL, law, straight, MAPPED_S).left_mm[0])
         for name, law in every_law.items()
     }
-    return Portrait(shown, maps, left_mm, rates)  # type: ignore[arg-type]
+    return Portrait(shown, maps, left_mm, rates)
 
 
 PLANES = ((0, 1), (1, 2), (0, 2))

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from functools import partial
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -44,14 +45,14 @@ def compute(progress: Progress) -> Tracks:
     """Drive every run."""
     wanted, runs = every_key(), {}
     for number, key in enumerate(wanted):
-        name = f"{TASKS[key.task]}, {key.plant}, {key.gains}, {1000 * key.period_s:g} ms"
-        runs[key] = run(
-            key,
-            lambda done, total, first=number, name=name: progress(  # type: ignore[misc]
-                round(100 * (first + done / total)), 100 * len(wanted), name
-            ),
-        )
+        runs[key] = run(key, partial(_of_run, progress, key, number, len(wanted)))
     return Tracks(runs)
+
+
+def _of_run(progress: Progress, key: Key, number: int, runs: int, done: int, total: int) -> None:
+    """The progress of one of some runs, in hundredths of a run."""
+    name = f"{TASKS[key.task]}, {key.plant}, {key.gains}, {1000 * key.period_s:g} ms"
+    progress(round(100 * (number + done / total)), 100 * runs, name)
 
 
 def draw(data: Tracks) -> Mapping[str, Figure]:

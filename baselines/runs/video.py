@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -194,13 +195,17 @@ Writer = Callable[[Path, Callable[[], Iterator[np.ndarray]], Iterator[np.ndarray
 
 
 def _writer_of(ending: str) -> Writer:
-    """What writes a format: called with a path, some frames, all frames, and their number per second."""
+    """What writes a format: called with a path, some frames, all frames, and their number per second.
+
+    Raises
+    ------
+    ImportError
+        if the package for it is missing.
+    """
     if ending == ".gif":
-        import PIL.Image  # noqa: F401 - whether it is there
-
+        import_module("PIL.Image")
         return _write_gif
-    import imageio_ffmpeg  # noqa: F401 - whether it is there
-
+    import_module("imageio_ffmpeg")
     return _write_mp4
 
 
