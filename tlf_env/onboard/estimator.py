@@ -107,7 +107,7 @@ def inverse_innovation_covariance(
 
 @law
 def pose_gain(estimate: Estimate, i_xx: float, i_xy: float, i_yy: float) -> PoseGain:
-    """Eq. (39): P Hᵀ S⁻¹ for the inverse ``i`` of S."""
+    """Eq. (40): P Hᵀ S⁻¹ for the inverse ``i`` of S."""
     return PoseGain(
         xx=estimate.p_xx * i_xx + estimate.p_xy * i_xy,
         xy=estimate.p_xx * i_xy + estimate.p_xy * i_yy,
@@ -120,7 +120,7 @@ def pose_gain(estimate: Estimate, i_xx: float, i_xy: float, i_yy: float) -> Pose
 
 @law
 def corrected_pose(estimate: Estimate, gain: PoseGain, d_x: float, d_y: float) -> Estimate:
-    """Eqs (40) and (41): pose and covariance after an innovation in world axes (mm)."""
+    """Eqs (31) and (41): pose and covariance after an innovation in world axes (mm)."""
     return Estimate(
         x=estimate.x + gain.xx * d_x + gain.xy * d_y,
         y=estimate.y + gain.yx * d_x + gain.yy * d_y,
