@@ -16,7 +16,7 @@ import pytest
 from hypothesis import settings
 
 import tlf_env
-from baselines import ReferencePolicy
+from baselines import ReferencePolicy, cli
 from tlf_env.onboard.tracking import TrackingGains
 
 Actions = dict[str, np.ndarray]
@@ -168,3 +168,28 @@ def benched(folder: Path, plan: str, words: str) -> Path:
         patch.setattr(sys, "argv", ["tlf", *given.split()])
         main()
     return folder / "made"
+
+
+class Aborted(ReferencePolicy):
+    """The reference, interrupted in its 51st step."""
+
+    calls = 0
+
+    def predict(self, *args: Any, **kwargs: Any) -> Any:
+        self.calls += 1
+        if self.calls > 50:
+            raise KeyboardInterrupt
+        return super().predict(*args, **kwargs)
+
+
+def refused(
+    words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> str:
+    """The one line with which the command line refuses some words as bad input."""
+    monkeypatch.setattr("sys.argv", ["tlf", *words])
+    with pytest.raises(SystemExit) as stopped:
+        cli.main()
+    assert stopped.value.code == cli.BAD_INPUT
+    lines = capsys.readouterr().err.splitlines()
+    assert len(lines) == 1
+    return lines[0]

@@ -11,6 +11,7 @@ import gymnasium
 import pettingzoo
 import pytest
 import typer
+from helpers import refused
 
 import tlf_env
 from baselines import cli
@@ -33,16 +34,6 @@ CHANGED = {
 def printed(capsys: pytest.CaptureFixture[str], *words: str) -> str:
     cli.app(list(words), standalone_mode=False)
     return capsys.readouterr().out
-
-
-def refused(words: list[str], capsys: pytest.CaptureFixture[str], monkeypatch) -> str:
-    monkeypatch.setattr("sys.argv", ["tlf", *words])
-    with pytest.raises(SystemExit) as stopped:
-        cli.main()
-    assert stopped.value.code == cli.BAD_INPUT
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    return lines[0]
 
 
 # --- list

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from helpers import refused
 
 from baselines import cli
 from baselines.commands.live import menus
@@ -386,16 +387,6 @@ def test_the_lists_have_the_shipped_names() -> None:
 
 
 # --- the command
-
-
-def refused(words: list[str], capsys: Any, monkeypatch: Any) -> str:
-    monkeypatch.setattr("sys.argv", ["tlf", *words])
-    with pytest.raises(SystemExit) as stopped:
-        cli.main()
-    assert stopped.value.code == cli.BAD_INPUT
-    lines = capsys.readouterr().err.splitlines()
-    assert len(lines) == 1
-    return lines[0]
 
 
 @pytest.mark.parametrize(

@@ -11,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import Aborted
 
 from baselines import cli
 from baselines.commands.compare import names_of
@@ -148,15 +149,6 @@ def test_a_page_has_the_world():
 
 
 def test_an_aborted_run_has_a_page_of_what_was_simulated(tmp_path, monkeypatch):
-    class Aborted(ReferencePolicy):
-        calls = 0
-
-        def predict(self, *args, **kwargs):
-            self.calls += 1
-            if self.calls > 50:
-                raise KeyboardInterrupt
-            return super().predict(*args, **kwargs)
-
     record = run_policy(load_scenario("infinity", horizon_s=4.0), Aborted(), 0, name="aborted")
     source = write_replay(record, tmp_path / "replay.html").read_text(encoding="utf-8")
     assert held(source)["runs"][0]["rows"] == 51

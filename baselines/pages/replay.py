@@ -19,6 +19,7 @@ from baselines.runs.borders import fixed_borders, patches, shape_border
 from baselines.runs.run import Record
 from tlf_env.common.files import atomic
 from tlf_env.rendering import looks
+from tlf_env.rendering.scene import named_patches
 
 SCRIPTS = ("replay_data.js", "replay_plane.js", "replay_plots.js", "replay.js")
 STYLES = ("replay.css",)
@@ -186,10 +187,7 @@ def run_data(record: Record, name: str, stride: int = 1) -> dict[str, Any]:
         "horizon_s": scenario.horizon_s,
         "lost_beyond_mm": scenario.lost_beyond_mm,
         "walls": [points(one) for one in fixed_borders(record)],
-        "patches": [
-            {"x_mm": one.x, "y_mm": one.y, "radius_mm": one.radius, "scale": round(one.scale, 4)}
-            for one in patches(record)
-        ],
+        "patches": named_patches(patches(record)),
         "things": _things(record),
         "objects": None if record.objects is None else exact(record.objects[rows]),
         "palette": {

@@ -87,7 +87,7 @@
       pen.fillStyle = Replay.css("soft");
       pen.font = "12px system-ui, sans-serif";
       pen.textAlign = "center";
-      pen.fillText(`friction × ${patch.scale}`, ...px(patch.x_mm, patch.y_mm));
+      pen.fillText(`friction × ${+patch.scale.toPrecision(3)}`, ...px(patch.x_mm, patch.y_mm));
     }
     for (const wall of first.walls) {
       shape(wall);

@@ -104,24 +104,24 @@ def read_record(folder: Path) -> Record:
     about = folder / SUMMARY
     if not about.is_file():
         raise ValueError(f"{folder} holds no run: there is no {SUMMARY} in it")
-    told = read_json(about)
+    written = read_json(about)
     path = folder / TRAJECTORY
     try:
-        scenario = Scenario.model_validate(told["scenario"])
+        scenario = Scenario.model_validate(written["scenario"])
         with np.load(path, allow_pickle=False) as file:
             found = {name: file[name] for name in file.files}
         ends = {name: found.pop(name) for name in ENDS}
         record = Record(
             scenario=scenario,
-            seed=int(told["seed"]),
-            policy=str(told["policy"]),
+            seed=int(written["seed"]),
+            policy=str(written["policy"]),
             t_s=found.pop("t_s"),
             leader=found.pop("leader_reference_mm"),
             objects=found.pop("objects", None),
             columns={name: found.pop(name) for name in RECORDED},
             signals=found,
-            options=told["reset_options"],
-            interrupted=bool(told["interrupted"]),
+            options=written["reset_options"],
+            interrupted=bool(written["interrupted"]),
             **ends,
         )
     except FileNotFoundError:

@@ -9,7 +9,7 @@ from baselines.runs.run import Record
 from baselines.runs.video import FPS, Film
 from tlf_env.physics.shapes import Kind, PlacedShape
 from tlf_env.physics.world import CircleShape, Shape, Wall, capsules_of, corners_of, placed
-from tlf_env.rendering.scene import STILL_MM, Scene
+from tlf_env.rendering.scene import Scene, ghosts, named_patches
 
 
 def film_of(record: Record, fps: float = FPS, speed: float = 1.0) -> Film:
@@ -35,10 +35,7 @@ def film_of(record: Record, fps: float = FPS, speed: float = 1.0) -> Film:
         robots=record.scenario.robot_models,
         path_mm=record.leader,
         fps=1 / period_s,
-        patches=[
-            {"x_mm": one.x, "y_mm": one.y, "radius_mm": one.radius, "scale": one.scale}
-            for one in patches(record)
-        ],
+        patches=named_patches(patches(record)),
         courses_mm=[thing.corners_mm() for thing in record.scenario.world.moving],
     )
     return film
@@ -55,7 +52,11 @@ def _scene(record: Record, row: int, angles: list[np.ndarray], fixed: list[Place
         values: np.ndarray = record[name][row]
         return values
 
-    ghosts = _ghosts(record, row)
+    ghost = ghosts(
+        row - record.scenario.gap_steps,
+        lambda step: np.stack([record["x_mm"][step], record["y_mm"][step]]),
+        of("theta_rad"),
+    )
     t_s = float(record.t_s[row])
     touched = record.touched_at_s <= t_s + 1e-9
     return Scene(
@@ -69,9 +70,9 @@ def _scene(record: Record, row: int, angles: list[np.ndarray], fixed: list[Place
         reference_x_mm=of("reference_x_mm"),
         reference_y_mm=of("reference_y_mm"),
         reference_theta_rad=of("reference_theta_rad"),
-        ghost_x_mm=ghosts[0],
-        ghost_y_mm=ghosts[1],
-        ghost_theta_rad=ghosts[2],
+        ghost_x_mm=ghost[0],
+        ghost_y_mm=ghost[1],
+        ghost_theta_rad=ghost[2],
         slip_l_mm_s=of("tyre_slip_left_mm_s"),
         slip_r_mm_s=of("tyre_slip_right_mm_s"),
         slip_c_mm_s=of("tyre_slip_castor_mm_s"),
@@ -82,21 +83,6 @@ def _scene(record: Record, row: int, angles: list[np.ndarray], fixed: list[Place
         touched_by=np.where(touched, record.touched_by, 0),
         objects=(*fixed, *moved_shapes(record, row)),
     )
-
-
-def _ghosts(record: Record, row: int) -> np.ndarray:
-    """Pose of every robot's predecessor one gap ago, ``(3, robot)``, as in :mod:`tlf_env.rendering.scene`."""
-    ghosts = np.full((3, record.robots), np.nan)
-    then = row - record.scenario.gap_steps
-    if then < 0 or record.robots == 1:
-        return ghosts
-    x, y = record["x_mm"][:, :-1], record["y_mm"][:, :-1]
-    after, before = then + 1, max(then - 1, 0)
-    went_x, went_y = x[after] - x[before], y[after] - y[before]
-    ghosts[0, 1:], ghosts[1, 1:] = x[then], y[then]
-    moved = np.hypot(went_x, went_y) > STILL_MM
-    ghosts[2, 1:] = np.where(moved, np.arctan2(-went_x, went_y), record["theta_rad"][row, :-1])
-    return ghosts
 
 
 def fixed_shapes(record: Record) -> list[PlacedShape]:

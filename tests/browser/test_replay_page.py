@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from helpers import Aborted
 
 from baselines.pages.replay import write_comparison, write_replay
 from baselines.policies.reference import ReferencePolicy
@@ -240,18 +241,6 @@ def test_a_name_stays_text(records, tmp_path, at, complaints):
     page = at(write_replay(record, tmp_path / "one.html"), 1.0)
     assert HOSTILE in page.find_element("css selector", "h1").text
     assert not complaints()
-
-
-class Aborted(ReferencePolicy):
-    """Interrupted in its 51st step."""
-
-    calls = 0
-
-    def predict(self, *args, **kwargs):
-        self.calls += 1
-        if self.calls > 50:
-            raise KeyboardInterrupt
-        return super().predict(*args, **kwargs)
 
 
 def test_an_aborted_run_is_replayed_to_its_end(tmp_path, at, complaints):

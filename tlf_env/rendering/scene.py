@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable
 from typing import NamedTuple
 
 import numpy as np
@@ -80,28 +81,47 @@ def scene_of(formation: Formation) -> Scene:
 
 
 def patches_of(formation: Formation) -> list[dict[str, float]]:
-    """The patches of different friction under a formation: ``x_mm``, ``y_mm``, ``radius_mm`` and ``scale``."""
+    """The patches of different friction under a formation, as :func:`named_patches`."""
     rows = formation.arrays.patches[formation.arrays.variants[0]].tolist()
+    return named_patches(map(PatchRow._make, rows))
+
+
+def named_patches(rows: Iterable[PatchRow]) -> list[dict[str, float]]:
+    """Patches by ``x_mm``, ``y_mm``, ``radius_mm`` and ``scale``, without those that have no effect."""
     return [
         {"x_mm": patch.x, "y_mm": patch.y, "radius_mm": patch.radius, "scale": patch.scale}
-        for patch in map(PatchRow._make, rows)
-        if patch.scale != 1  # otherwise the patch has no effect
+        for patch in rows
+        if patch.scale != 1
     ]
 
 
 def _ghosts(formation: Formation, theta: np.ndarray) -> np.ndarray:
-    """Pose of every robot's predecessor one gap ago, ``(3, robot)``.
+    """The ghosts of a formation now, as :func:`ghosts`."""
+    step = formation.step_count - formation.scenario.gap_steps
+    return ghosts(step, formation.true_positions, theta)
+
+
+def ghosts(step: int, positions: Callable[[int], np.ndarray], theta: np.ndarray) -> np.ndarray:
+    """Pose of every robot's predecessor one gap ago, ``(3, robot)``; NaN where there is none.
 
     Its heading is the direction of its motion, or its present heading if it was at rest.
+
+    Parameters
+    ----------
+    step
+        The control step one gap ago.
+    positions
+        Gives the true positions at a step, ``(2, robot)``, mm; also one step later.
+    theta
+        Present headings, ``(robot,)``, rad.
     """
-    ghosts = np.full((3, len(theta)), np.nan)
-    step = formation.step_count - formation.scenario.gap_steps
+    found = np.full((3, len(theta)), np.nan)
     if step < 0 or len(theta) == 1:
-        return ghosts
-    before = formation.true_positions(max(step - 1, 0))[:, :-1]  # of the predecessors
-    after = formation.true_positions(step + 1)[:, :-1]
+        return found
+    before = positions(max(step - 1, 0))[:, :-1]  # of the predecessors
+    after = positions(step + 1)[:, :-1]
     went_x, went_y = after - before
-    ghosts[:2, 1:] = formation.true_positions(step)[:, :-1]
+    found[:2, 1:] = positions(step)[:, :-1]
     moved = np.hypot(went_x, went_y) > STILL_MM
-    ghosts[2, 1:] = np.where(moved, np.arctan2(-went_x, went_y), theta[:-1])
-    return ghosts
+    found[2, 1:] = np.where(moved, np.arctan2(-went_x, went_y), theta[:-1])
+    return found
