@@ -974,8 +974,8 @@ def paper(
     figures: Annotated[
         str,
         typer.Option(
-            help="fig7ab, fig7c, fig8, observer, proofs and fig11, comma-separated; or all. What the folder "
-            "has of the others stays on its page."
+            help="fig7ab, fig7c, fig8, slip, ekf, observer, proofs, fig11, robustness and unpublished, "
+            "comma-separated; or all. What the folder has of the others stays on its page."
         ),
     ] = "all",
     out: Annotated[Path, typer.Option(help="Folder of the page and the figures.")] = Path(

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -89,8 +89,13 @@ def complementary(
     )
 
 
-def rates(e: np.ndarray, u_1: float, u_2: float, law: Law) -> np.ndarray:
-    """ė of eq. (20), and of (17) with (19) and (21) if the complementary law is on; e is (3, start)."""
+def rates(
+    e: np.ndarray, u_1: float, u_2: float, law: Law, slip: tuple[Any, Any] = (0.0, 0.0)
+) -> np.ndarray:
+    """ė of eq. (20), and of (17) with (19) and (21) if the complementary law is on; e is (3, start).
+
+    ``slip`` is δ₁ (mm/s) and δ₂ (rad/s) of eq. (14).
+    """
     e_1, e_2, e_3 = e
     gains = law.gains
     sin = np.sin(e_3)
@@ -99,18 +104,38 @@ def rates(e: np.ndarray, u_1: float, u_2: float, law: Law) -> np.ndarray:
     if law.complementary:
         r_1, r_2 = complementary(e_1, sin, gains)
         turn, forward = turn + r_2, forward - r_1
+    turn, forward = turn + slip[1], forward - slip[0]
     return np.stack([forward - e_2 * (u_2 + turn), e_1 * (u_2 + turn) - u_1 * sin, -turn])
 
 
-def advance(e: np.ndarray, t_s: float, law: Law, reference: Reference) -> np.ndarray:
+def advance(
+    e: np.ndarray,
+    t_s: float,
+    law: Law,
+    reference: Reference,
+    slip: tuple[Any, Any] = (0.0, 0.0),
+) -> np.ndarray:
     """One step of Runge and Kutta's fourth order."""
     h = STEP_S
     now, middle, then = reference(t_s), reference(t_s + h / 2), reference(t_s + h)
-    k_1 = rates(e, *now, law)
-    k_2 = rates(e + h / 2 * k_1, *middle, law)
-    k_3 = rates(e + h / 2 * k_2, *middle, law)
-    k_4 = rates(e + h * k_3, *then, law)
+    k_1 = rates(e, *now, law, slip)
+    k_2 = rates(e + h / 2 * k_1, *middle, law, slip)
+    k_3 = rates(e + h / 2 * k_2, *middle, law, slip)
+    k_4 = rates(e + h * k_3, *then, law, slip)
     return e + h / 6 * (k_1 + 2 * k_2 + 2 * k_3 + k_4)
+
+
+def settled(
+    law: Law, reference: Reference, slip: tuple[Any, Any], duration_s: float, count: int = 1
+) -> np.ndarray:
+    """The errors (3, case) that constant slip leaves, from no error at the start.
+
+    Gains and slip are numbers, or arrays with one for each of ``count`` cases.
+    """
+    e = np.zeros((3, count))
+    for k in range(round(duration_s / STEP_S)):
+        e = advance(e, k * STEP_S, law, reference, slip)
+    return e
 
 
 def paths(

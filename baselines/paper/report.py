@@ -22,9 +22,9 @@ INTRODUCTION = (
     "that damps the heading.",
 )
 OPEN = (
-    "Not examined here: the robustness of whole formations against κ ± 50 % and against the number of "
-    "robots, the scaling of the ultimate bound with ε and η and with slip, the consistency of the EKF and "
-    "its behaviour under skid, and the sensitivity to the unpublished parameters.",
+    "Fig. 11 has one seed. The experiment of Fig. 7(c) excites both wheels alike, so that it says nothing "
+    "about the differential mode. The screening varies neither the period of the wheel loop and the filter, "
+    "which is 1 ms, nor their noise, nor the joints' friction, which Table I gives.",
 )
 HEAD = ("claim", "paper", "computed", "rule", "verdict", "figure")
 CLASSES = {Verdict.REPRODUCED: "good", Verdict.PARTLY: "part", Verdict.NOT: "bad"}

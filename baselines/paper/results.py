@@ -7,7 +7,18 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from baselines.paper import follower, nyquist, portrait, proofs, shaping, tracks
+from baselines.paper import (
+    filter,
+    follower,
+    nyquist,
+    portrait,
+    proofs,
+    robustness,
+    shaping,
+    slip,
+    tracks,
+    unpublished,
+)
 from baselines.paper.claims import Finding, judge
 from baselines.paper.look import write
 from baselines.paper.parts import Part, Progress, Table
@@ -16,7 +27,18 @@ from tlf_env.common.files import atomic, read_json
 
 PARTS: dict[str, Part] = {
     module.PART.name: module.PART
-    for module in (shaping, nyquist, portrait, follower, proofs, tracks)
+    for module in (
+        shaping,
+        nyquist,
+        portrait,
+        slip,
+        filter,
+        follower,
+        proofs,
+        tracks,
+        robustness,
+        unpublished,
+    )
 }
 FILE = "paper.json"
 
