@@ -543,7 +543,9 @@ def test_a_map_of_the_page_is_computed_anew():
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["fig7c", "fig8", "slip", "ekf", "fig11", "robustness", "unpublished"])
+@pytest.mark.parametrize(
+    "name", ["fig7c", "fig8", "slip", "ekf", "fig11", "robustness", "unpublished"]
+)
 def test_the_rest_of_the_page_is_computed_anew(name, tmp_path):
     assert_same(name, make(PARTS[name], tmp_path, no_progress))
 

@@ -20,10 +20,11 @@ from baselines.policies.laws.catalogue import LAWS, read_law
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.registry import fit_policy
 from baselines.runs.run import run_seeds
+from baselines.runs.trials import STUDY_FILE
 from baselines.tuning import search
 from baselines.tuning.config import CAPS, Objective, TuneConfig, load_tune
 from baselines.tuning.search import RESULT_FILE, run_tune
-from baselines.tuning.study import SCORES, STUDY_FILE, StoredStudy
+from baselines.tuning.study import SCORES, StoredStudy
 from baselines.tuning.trial import Outcome, TrialJob, measured, run_trial
 from tlf_env.onboard.controllers import controller, load_controller
 from tlf_env.onboard.limiter import BOUNDS
@@ -127,14 +128,14 @@ def test_a_trial_that_was_driven_and_not_stored_whole_is_driven_again(
     monkeypatch.setattr(search, "run_trial", quick)
     study = StoredStudy(config(), tmp_path)
 
-    real = getattr(study._study._storage, write)
+    real = getattr(study.store.study._storage, write)
 
     def stops(*words, **named):
         if len(study.trials("COMPLETE", "PRUNED")) == 4:
             raise KeyboardInterrupt
         return real(*words, **named)
 
-    monkeypatch.setattr(study._study._storage, write, stops)
+    monkeypatch.setattr(study.store.study._storage, write, stops)
     jobs = study.jobs()
     for _ in range(4):
         study.tell(quick(config(), next(jobs)))

@@ -15,9 +15,10 @@ from typing import Any
 
 from baselines.runs.jobs import alone_in, spread
 from baselines.runs.provenance import git_revision, simulation_digest, versions
+from baselines.runs.trials import optuna_package
 from baselines.tuning.config import TuneConfig
 from baselines.tuning.start import LawStart
-from baselines.tuning.study import StoredStudy, optuna_package
+from baselines.tuning.study import StoredStudy
 from baselines.tuning.trial import Outcome, TrialJob, run_trial
 from tlf_env.common.files import atomic
 from tlf_env.common.presets import yaml_text

@@ -2,22 +2,19 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from baselines.runs.jobs import claim
 from baselines.runs.provenance import git_revision, simulation_digest, versions
+from baselines.runs.trials import TrialStore, optuna_package
 from baselines.tuning.config import TuneConfig
 from baselines.tuning.trial import Outcome, TrialJob
-from tlf_env.common.errors import install_command
 from tlf_env.task.neutral import scenario_hash
 
-SEARCH_FILE, STUDY_FILE = "search.json", "study.db"
+SEARCH_FILE = "search.json"
 STUDY_NAME = "tune"
 SCORES, CHOSEN = "scores", "choose_{}"  # attributes of a trial, and of the study for each finalist
 
@@ -39,9 +36,6 @@ class StoredStudy:
     def __init__(self, config: TuneConfig, folder: Path) -> None:
         self.config = config
         optuna = optuna_package()
-        from sqlalchemy import URL
-        from sqlalchemy.exc import SQLAlchemyError
-
         asked = config.model_dump(mode="json")
         del asked["trials"]  # a larger number continues the search
         scenarios = {
@@ -53,49 +47,30 @@ class StoredStudy:
         keys = tuple(record)
         record |= {"versions": versions(), "git_revision": git_revision()}
         claim(folder / SEARCH_FILE, record, keys, "a search")
-        url = URL.create("sqlite", database=str((folder / STUDY_FILE).absolute()))
-        try:
-            self._study = optuna.create_study(
-                storage=url.render_as_string(hide_password=False),
-                study_name=STUDY_NAME,
-                load_if_exists=True,
-            )
-            self._study.get_trials()
-        except (SQLAlchemyError, RuntimeError, optuna.exceptions.OptunaError) as error:
-            raise ValueError(
-                f"{folder / STUDY_FILE} cannot be read; choose another --out, or remove {folder}"
-            ) from error
-        self._distributions = {
-            path: optuna.distributions.FloatDistribution(span.low, span.high, log=span.log)
-            for path, span in config.search.items()
-        }
+        self.store = TrialStore(
+            folder,
+            STUDY_NAME,
+            {
+                path: optuna.distributions.FloatDistribution(span.low, span.high, log=span.log)
+                for path, span in config.search.items()
+            },
+            sampler_seed=config.sampler_seed,
+            startup_trials=config.startup_trials,
+        )
 
     def trials(self, *states: str) -> list[Any]:
         """Trials in one of the states (without states: all), by number."""
-        kept = [
-            trial
-            for trial in self._study.get_trials(deepcopy=False)
-            if not states or trial.state.name in states
-        ]
-        return sorted(kept, key=lambda trial: trial.number)
+        return self.store.trials(*states)
 
     def jobs(self) -> Iterator[TrialJob]:
         """The next trials to run: first the interrupted ones, then new proposals, up to ``trials``.
 
         A proposal is made only when the generator is advanced.
         """
-        optuna = optuna_package()
         for cut in self.trials("RUNNING"):
             yield self._job(cut)
-        while len(known := self.trials()) < self.config.trials:
-            self._study.add_trial(
-                optuna.trial.create_trial(
-                    state=optuna.trial.TrialState.RUNNING,
-                    params=self._proposal(known) if known else self.config.start_values,
-                    distributions=self._distributions,
-                )
-            )
-            yield self._job(self.trials()[-1])
+        while len(self.trials()) < self.config.trials:
+            yield self._job(self.store.propose(self.config.start_values))
 
     def _job(self, trial: Any) -> TrialJob:
         return TrialJob(
@@ -112,33 +87,14 @@ class StoredStudy:
         failed = accumulate(int(row["failed"]) for row in strata.values())
         return {place: before + more for place, before in zip(strata, failed, strict=True)}
 
-    def _proposal(self, known: list[Any]) -> dict[str, float]:
-        """Values of the next trial, proposed by a study in memory that contains all trials so far."""
-        optuna = optuna_package()
-        entropy = np.random.SeedSequence([self.config.sampler_seed, len(known)])
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", optuna.exceptions.ExperimentalWarning)
-            sampler = optuna.samplers.TPESampler(
-                multivariate=True,
-                constant_liar=True,
-                n_startup_trials=self.config.startup_trials,
-                seed=int(entropy.generate_state(1)[0]),
-            )
-        mirror = optuna.create_study(sampler=sampler)
-        mirror.add_trials(known)
-        values: dict[str, float] = mirror.ask(self._distributions).params
-        return values
-
     def tell(self, outcome: Outcome) -> None:
         """Store the outcome of a trial; it is on the disk when this returns."""
-        optuna = optuna_package()
-        handle = optuna.trial.Trial(self._study, self.trials()[outcome.number]._trial_id)
-        handle.set_user_attr(SCORES, outcome._asdict())
-        if outcome.stopped:  # Optuna takes the last intermediate value of a pruned trial
-            handle.report(outcome.score, len(outcome.strata))
-            self._study.tell(outcome.number, state=optuna.trial.TrialState.PRUNED)
-        else:
-            self._study.tell(outcome.number, outcome.score)
+        self.store.tell(
+            outcome.number,
+            outcome.score,
+            {SCORES: outcome._asdict()},
+            stopped_at=len(outcome.strata) if outcome.stopped else None,
+        )
 
     def outcomes(self) -> list[Outcome]:
         """Outcomes of the completed trials, the best first."""
@@ -157,26 +113,10 @@ class StoredStudy:
 
     def chosen(self) -> dict[int, Outcome]:
         """Outcomes on the choosing seeds of those finalists that have been run there."""
-        attributes = self._study.user_attrs
+        attributes = self.store.study.user_attrs
         keys = {number: CHOSEN.format(number) for number in self.finalists()}
         return {n: Outcome(**attributes[key]) for n, key in keys.items() if key in attributes}
 
     def choose(self, outcome: Outcome) -> None:
         """Store the outcome of a finalist on the choosing seeds."""
-        self._study.set_user_attr(CHOSEN.format(outcome.number), outcome._asdict())
-
-
-def optuna_package() -> Any:
-    """The package optuna, with its log messages below warnings switched off.
-
-    Raises
-    ------
-    ValueError
-        if it is missing.
-    """
-    try:
-        import optuna
-    except ModuleNotFoundError as error:
-        raise ValueError(f"the search needs optuna ({install_command('tune')})") from error
-    optuna.logging.set_verbosity(optuna.logging.WARNING)
-    return optuna
+        self.store.study.set_user_attr(CHOSEN.format(outcome.number), outcome._asdict())
