@@ -871,6 +871,7 @@ def export(
 
 @app.command(epilog=examples("train"))
 def train(
+    ctx: typer.Context,
     config: Annotated[
         str,
         typer.Argument(
@@ -883,25 +884,62 @@ def train(
         int | None, typer.Option(help="Control steps × robots; overrides the file's.")
     ] = None,
     processes: Annotated[
-        int, typer.Option(help="Seeds at a time on this machine; 0: one per core.")
+        int,
+        typer.Option(
+            help="Seeds, or trials of a search, at a time on this machine; 0: one per core. A search is "
+            "repeatable with 1 only."
+        ),
     ] = 0,
     ray: Annotated[str | None, RAY] = None,
     out: Annotated[
-        Path | None, typer.Option(help="Folder of the results; default results/train/CONFIG.")
+        Path | None,
+        typer.Option(
+            help="Folder of the results; default results/train/CONFIG, of a search results/search/CONFIG."
+        ),
+    ] = None,
+    search: Annotated[
+        bool,
+        typer.Option(
+            "--search", help="Search for better numbers: the ranges of its section `search`."
+        ),
+    ] = False,
+    trials: Annotated[
+        int | None,
+        typer.Option(
+            min=1,
+            help="Number of trials of a search, those of earlier calls included.",
+            show_default=False,
+        ),
     ] = None,
     as_json: Annotated[
         bool, typer.Option("--json", help="Print the evaluations as JSON instead of the table.")
     ] = False,
 ) -> None:
     """Train one policy per seed. Interrupt it, and call it again to continue to the same result."""
-    from baselines.training.config import load_config
+    from baselines.training.config import load_config, with_trials
 
+    if trials is not None and not search:
+        raise ValueError("--trials goes with --search")
+    if search and (given(ctx, "seeds") or given(ctx, "robot_steps")):
+        raise ValueError(
+            "--seeds and --robot-steps do not go with --search: its section `search` has its own"
+        )
     loaded = load_config(config, robot_steps=robot_steps)
     numbers = whole_numbers("seeds", seeds)
     try:
-        from baselines.commands.train import train_command
+        from baselines.commands.train import search_command, train_command
     except ModuleNotFoundError as error:
         raise ValueError(f"training needs {error.name} ({install_command('train')})") from error
+    if search:
+        search_command(
+            with_trials(loaded, trials),
+            Path(config).stem,
+            out=out,
+            processes=processes or os.cpu_count() or 1,
+            ray=ray,
+            as_json=as_json,
+        )
+        return
     train_command(
         loaded,
         Path(config).stem,

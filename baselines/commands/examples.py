@@ -64,6 +64,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "tlf train quick": "a few minutes, into results/train/quick",
         "tlf train residual --seeds 1": "a shipped policy again, from another seed",
         "tlf train own.yaml --robot-steps 200000": "a training of your own, shorter",
+        "tlf train scratch --search --processes 1": "better numbers of PPO, within the file's ranges",
     },
     "tune": {"tlf tune adrc --trials 50": "a search of the gains; call it again to continue"},
     "paper": {

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,7 @@ from baselines.tables import training_table
 from baselines.training.config import TrainConfig
 from baselines.training.curve import kept_evaluation
 from baselines.training.scoring import overall_mm, score_default
+from baselines.training.search import FOUND_FILE, Outcome, run_search, search_of
 from baselines.training.train import POLICY_FILE
 from baselines.training.train_seeds import train_seeds
 from tlf_env.common.files import atomic, read_json
@@ -94,6 +95,67 @@ def train_command(
     )
     for line in next_commands(config, folder):
         screen.print(line, soft_wrap=True)
+
+
+def search_command(
+    config: TrainConfig,
+    name: str,
+    *,
+    out: Path | None,
+    processes: int,
+    ray: str | None,
+    as_json: bool,
+) -> None:
+    """Search for better numbers of a training, and print each trial, the finalists and what comes next.
+
+    Raises
+    ------
+    ValueError
+        as :func:`~baselines.training.search.run_search`.
+    """
+    search = search_of(config)
+    folder = writable_folder(out or Path("results/search") / name)
+    warn_of_scenarios(config.named_scenarios())
+    compile_before_first_run()
+
+    def finished(outcome: Outcome, values: Mapping[str, Any]) -> None:
+        state = "stopped at " if outcome.stopped else ""
+        notes.print(
+            f"trial {outcome.number}: {state}{outcome.score_mm:.2f} mm ({worded(values)})",
+            soft_wrap=True,
+        )
+
+    with progress_bar(f"search {name}") as update:
+        found = run_search(
+            config,
+            folder,
+            processes=processes,
+            ray_address=ray,
+            command=command_line(sys.argv[1:]),
+            progress=update,
+            finished=finished,
+        )
+    if as_json:
+        typer.echo(json.dumps(found, indent=1, allow_nan=False))
+        return
+    seeds = ", ".join(map(str, search.choose_seeds))
+    screen.print(f"Trials: {found['trials']}, of which {found['stopped']} were stopped. Finalists:")
+    for one in found["finalists"]:
+        start = " (the file itself)" if one["trial"] == 0 else ""
+        screen.print(
+            f"  trial {one['trial']}{start}: {one['choose_mm']:.2f} mm with the training seeds {seeds}, "
+            f"{one['search_mm']:.2f} mm in the search; {worded(one['values'])}",
+            soft_wrap=True,
+        )
+    screen.print(f"In {folder}: {FOUND_FILE}; train with it:")
+    screen.print(
+        f"  tlf train {shlex.quote(str(folder / FOUND_FILE))} --seeds 0,1,2", soft_wrap=True
+    )
+
+
+def worded(values: Mapping[str, Any]) -> str:
+    """Values by path, in one line."""
+    return ", ".join(f"{path} {value}" for path, value in values.items())
 
 
 def default_score(config: TrainConfig, folder: Path) -> dict[str, Any]:

@@ -18,8 +18,8 @@ def value_at(tree: Any, path: str) -> Any:
     return tree
 
 
-def with_value(tree: dict[str, Any], path: str, value: float) -> dict[str, Any]:
-    """A copy of a nested mapping with one number replaced.
+def with_value(tree: dict[str, Any], path: str, value: Any) -> dict[str, Any]:
+    """A copy of a nested mapping with one value replaced.
 
     Raises
     ------

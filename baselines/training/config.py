@@ -10,10 +10,11 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from baselines.runs.splits import check_choosing, check_training
 from tlf_env.common.errors import one_line
-from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Whole
+from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch, Whole
 from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
 from tlf_env.task.scenario import Scenario, scenario_with
 from tlf_env.task.sources import BASE
@@ -85,6 +86,68 @@ class EvaluationConfig(Frozen):
         return self
 
 
+class SearchRange(Frozen):
+    """Values that a search tries for one entry: from ``low`` to ``high``, or ``one_of`` some."""
+
+    low: Number | None = None
+    high: Number | None = None
+    log: Switch = False  # uniform in the logarithm
+    whole: Switch = False  # whole numbers only
+    one_of: Annotated[tuple[Any, ...], Field(min_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if (self.one_of is None) == (self.low is None and self.high is None):
+            raise ValueError("needs either low and high, or one_of")
+        if self.one_of is not None:
+            if self.log or self.whole:
+                raise ValueError("log and whole go with low and high, not with one_of")
+            return self
+        if self.low is None or self.high is None:
+            raise ValueError("needs both low and high")
+        if not self.low < self.high:
+            raise ValueError(f"low {self.low:g} must be below high {self.high:g}")
+        if self.log and self.low <= 0:
+            raise ValueError(f"low {self.low:g} must be above 0 with log true")
+        if self.whole and (self.low % 1 or self.high % 1):
+            raise ValueError(
+                f"low {self.low:g} and high {self.high:g} must be whole with whole true"
+            )
+        return self
+
+    @property
+    def ends(self) -> tuple[Any, ...]:
+        """The values at the ends of the range, or all of ``one_of``."""
+        if self.one_of is not None:
+            return self.one_of
+        ends = (self.low, self.high)
+        return tuple(int(end) for end in ends if end is not None) if self.whole else ends
+
+
+class SearchConfig(Frozen):
+    """A search for better numbers of the training (``tlf train --search``); trial 0 is the file itself."""
+
+    ranges: Annotated[dict[str, SearchRange], Field(min_length=1)]  # by the path of an entry
+    robot_steps: Count  # of each trial
+    trials: Count = 20
+    evaluations: Count = 4  # in each trial, evenly; a trial is stopped at one of them
+    seeds: Annotated[tuple[Whole, ...], Field(min_length=1)] = (0,)  # training seeds of a trial
+    startup_trials: Count = 5  # drawn at random, and not stopped
+    finalists: Count = 3  # compared with the start on other training seeds
+    choose_seeds: Annotated[tuple[Whole, ...], Field(min_length=1)] = (1, 2)
+    sampler_seed: Annotated[Whole, Field(ge=0)] = 0
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        both = set(self.seeds) & set(self.choose_seeds)
+        if both:
+            raise ValueError(
+                f"choose_seeds {list(self.choose_seeds)} must differ from seeds {list(self.seeds)}: the "
+                f"finalists were found on {sorted(both)}"
+            )
+        return self
+
+
 class TrainConfig(Frozen):
     """A training: the algorithm, the episodes and the evaluation. Times in s."""
 
@@ -107,6 +170,7 @@ class TrainConfig(Frozen):
     curriculum: CurriculumConfig | None = None  # None: all levels from the start
     checkpoint_every: Count = 1_000_000  # robot steps
     evaluation: EvaluationConfig
+    search: SearchConfig | None = None  # of `tlf train --search`; a training itself does not use it
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -142,6 +206,37 @@ class TrainConfig(Frozen):
         self.mixture()
         self.evaluation_scenarios()
         return self
+
+    @model_validator(mode="after")
+    def _check_search(self) -> Self:
+        for path, span in self.search.ranges.items() if self.search else ():
+            for end in span.ends:
+                try:
+                    self.with_values({path: end})
+                except (ValueError, TypeError) as error:
+                    raise ValueError(f"search.ranges.{path}: {error}") from error
+        return self
+
+    @property
+    def recorded(self) -> dict[str, Any]:
+        """What a training is identified by: all of it but its search."""
+        return self.model_dump(mode="json", exclude={"search"})
+
+    def with_values(self, values: Mapping[str, Any], **fields: Any) -> TrainConfig:
+        """The same training without its search, with other values at some paths, and other fields.
+
+        Raises
+        ------
+        ValueError
+            for a path that does not exist, or a value that is not allowed there.
+        """
+        data = self.model_dump(mode="json") | {"search": None} | fields
+        for path, value in values.items():
+            data = with_value(data, path, value)
+        try:
+            return TrainConfig.model_validate(data)
+        except ValidationError as error:
+            raise ValueError(one_line(error, TrainConfig)) from error
 
     def shares(self, level_count: int | None = None) -> list[float]:
         """Shares of episodes of each disturbance at each level, with the first levels only, all if None."""
@@ -278,3 +373,10 @@ def load_config(source: str | Path | Mapping[str, Any], **overrides: Any) -> Tra
         return TrainConfig.model_validate(data)
     except ValidationError as error:
         raise ValueError(one_line(error, TrainConfig)) from error
+
+
+def with_trials(config: TrainConfig, trials: int | None) -> TrainConfig:
+    """The training with another number of trials in its search; None: as it is."""
+    if trials is None or config.search is None:
+        return config
+    return config.model_copy(update={"search": config.search.model_copy(update={"trials": trials})})

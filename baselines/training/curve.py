@@ -30,7 +30,7 @@ def write_curve(
 ) -> dict[str, Any]:
     """Write ``curve.json``; returns its content."""
     curve = {
-        "config": config.model_dump(mode="json"),
+        "config": config.recorded,
         "seed": seed,
         "versions": versions(),
         **vars(progress),

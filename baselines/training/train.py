@@ -215,7 +215,7 @@ def evaluate_and_keep(
             next(iter(tasks.values()))[0],
             training={
                 "robot_steps": model.num_timesteps,
-                "config": config.model_dump(mode="json"),
+                "config": config.recorded,
             },
             seeds={
                 "learner": [seed],
@@ -236,7 +236,7 @@ def check_folder(config: TrainConfig, seed: int, folder: Path) -> None:
         if it holds another training, or one with another simulation.
     """
     plan = {
-        "config": config.model_dump(mode="json"),
+        "config": config.recorded,
         "seed": seed,
         "scenarios": [f"{place}: {scenario_hash(one)}" for place, one in config.named_scenarios()],
         "simulation": simulation_digest(),
