@@ -169,7 +169,7 @@ class TestSearch:
         whole = search.run_search(config(), tmp_path / "whole")
         stops = []
 
-        def interrupt(outcome: search.Outcome, values: object) -> None:
+        def interrupt(outcome: search.Trained, values: object) -> None:
             stops.append(outcome.number)
             if len(stops) in (2, 4):
                 raise KeyboardInterrupt  # the outcome is not stored yet
@@ -221,7 +221,7 @@ class TestSearch:
         found = search.TrainingSearch(config(), tmp_path)
         for course in ([8.0, 4.0, 6.0], [8.0, 2.0, 1.0], [8.0, 3.0, 2.0]):
             job = next(found.jobs())
-            found.tell(search.Outcome(job.number, [course], 0, False))
+            found.tell(search.Trained(job.number, [course], 0, False))
         medians = next(found.jobs()).medians
         assert medians == pytest.approx(tuple(math.log(one) for one in (8.0, 3.0, 2.0)))
 

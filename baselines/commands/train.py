@@ -24,7 +24,7 @@ from baselines.tables import training_table
 from baselines.training.config import TrainConfig
 from baselines.training.curve import kept_evaluation
 from baselines.training.scoring import overall_mm, score_default
-from baselines.training.search import FOUND_FILE, Outcome, run_search, search_of
+from baselines.training.search import FOUND_FILE, Trained, run_search, search_of
 from baselines.training.train import POLICY_FILE
 from baselines.training.train_seeds import train_seeds
 from tlf_env.common.files import atomic, read_json
@@ -118,7 +118,7 @@ def search_command(
     warn_of_scenarios(config.named_scenarios())
     compile_before_first_run()
 
-    def finished(outcome: Outcome, values: Mapping[str, Any]) -> None:
+    def finished(outcome: Trained, values: Mapping[str, Any]) -> None:
         state = "stopped at " if outcome.stopped else ""
         notes.print(
             f"trial {outcome.number}: {state}{outcome.score_mm:.2f} mm ({worded(values)})",

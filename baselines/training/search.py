@@ -48,8 +48,8 @@ class TrialJob(NamedTuple):
     ]  # best logarithm of the score so far, at each evaluation; empty: none
 
 
-class Outcome(NamedTuple):
-    """Result of a trial."""
+class Trained(NamedTuple):
+    """What a trial came to."""
 
     number: int
     courses: list[list[float]]  # of each seed: scores at the evaluations, mm
@@ -104,7 +104,7 @@ def trial_config(config: TrainConfig, values: Mapping[str, Any]) -> TrainConfig:
     )
 
 
-def run_trial(shared: Shared, job: TrialJob) -> Outcome:
+def run_trial(shared: Shared, job: TrialJob) -> Trained:
     """Train a trial with each of its seeds, from checkpoints if there are any."""
     config, courses, failed = trial_config(shared.config, job.values), [], 0
     for seed in job.seeds:
@@ -116,10 +116,10 @@ def run_trial(shared: Shared, job: TrialJob) -> Outcome:
                 config, seed, place, threads=shared.threads, evaluated=_watch(course, job.medians)
             )
         except _StoppedError:
-            return Outcome(job.number, [[one["score_mm"] for one in course]], failed, True)
+            return Trained(job.number, [[one["score_mm"] for one in course]], failed, True)
         courses.append([one["score_mm"] for one in curve["evaluations"]])
         failed += kept_evaluation(curve)["failed"]
-    return Outcome(job.number, courses, failed, False)
+    return Trained(job.number, courses, failed, False)
 
 
 def evaluations_in(place: Path) -> list[dict[str, Any]]:
@@ -190,10 +190,10 @@ class TrainingSearch:
         params = self.store.trials()[number].params
         return {path: _taken(span, params[path]) for path, span in self.search.ranges.items()}
 
-    def outcomes(self, *states: str) -> list[Outcome]:
+    def outcomes(self, *states: str) -> list[Trained]:
         """Outcomes of the trials in some states (without states: the completed ones), the best first."""
         found = [
-            Outcome(**trial.user_attrs[COURSES])
+            Trained(**trial.user_attrs[COURSES])
             for trial in self.store.trials(*(states or ("COMPLETE",)))
         ]
         return sorted(found, key=lambda one: (one.score_mm, one.number))
@@ -223,7 +223,7 @@ class TrainingSearch:
         best = [np.minimum.accumulate(course[:count]) for course in courses]
         return tuple(float(value) for value in np.median(best, axis=0))
 
-    def tell(self, outcome: Outcome) -> None:
+    def tell(self, outcome: Trained) -> None:
         """Store the outcome of a trial."""
         steps = max(map(len, outcome.courses))
         self.store.tell(
@@ -238,13 +238,13 @@ class TrainingSearch:
         best = [one.number for one in self.outcomes()[: self.search.finalists]]
         return best if 0 in best else [*best, 0]
 
-    def chosen(self) -> dict[int, Outcome]:
+    def chosen(self) -> dict[int, Trained]:
         """Outcomes of those finalists that were trained with the other seeds."""
         kept = self.store.study.user_attrs
         keys = {number: CHOSEN.format(number) for number in self.finalists()}
-        return {n: Outcome(**kept[key]) for n, key in keys.items() if key in kept}
+        return {n: Trained(**kept[key]) for n, key in keys.items() if key in kept}
 
-    def choose(self, outcome: Outcome) -> None:
+    def choose(self, outcome: Trained) -> None:
         """Store the outcome of a finalist."""
         self.store.study.set_user_attr(CHOSEN.format(outcome.number), outcome._asdict())
 
@@ -257,7 +257,7 @@ def run_search(
     ray_address: str | None = None,
     command: str = "",
     progress: Callable[[int, int], None] | None = None,
-    finished: Callable[[Outcome, dict[str, Any]], None] | None = None,
+    finished: Callable[[Trained, dict[str, Any]], None] | None = None,
 ) -> dict[str, Any]:
     """Search, train the finalists with other seeds, and write ``found.yaml``.
 
@@ -289,7 +289,7 @@ def run_search(
     threads = 1
     update = progress or (lambda done, total: None)
 
-    def outcomes(jobs: Iterable[TrialJob]) -> Iterator[Outcome]:
+    def outcomes(jobs: Iterable[TrialJob]) -> Iterator[Trained]:
         shared = Shared(config, folder, threads)
         for outcome in spread(
             run_trial, shared, jobs, processes=processes, ray_address=ray_address
@@ -322,7 +322,7 @@ def _final(found: TrainingSearch, number: int) -> TrialJob:
     )
 
 
-def _write(found: TrainingSearch, chosen: dict[int, Outcome], command: str) -> dict[str, Any]:
+def _write(found: TrainingSearch, chosen: dict[int, Trained], command: str) -> dict[str, Any]:
     """Write the configuration of the best finalist, and say what was found."""
     ranking = sorted(chosen.values(), key=lambda one: (one.score_mm, one.number))
     best = ranking[0].number

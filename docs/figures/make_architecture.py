@@ -29,6 +29,7 @@ ROOMS = (
     "tlf_env.common",
 )
 WINGS = (
+    "cli",
     "commands",
     "policies",
     "runs",

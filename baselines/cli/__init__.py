@@ -1,0 +1,57 @@
+"""The command line ``tlf``. Policies, matplotlib and other heavy modules are imported where they are used.
+
+Exit status: 0, also for a run in which robots get lost (that is a result); 1 after an error of the
+system; 2 for invalid input, reported in one line; 130 after an interrupt.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Sequence
+
+import typer
+from typer.exceptions import TyperException
+
+from baselines.cli import driving, learning, looking, measuring, paper
+from baselines.cli.app import BAD_INPUT, FAILED, INTERRUPTED, app, completed
+from baselines.cli.measuring import PLAN_OPTIONS
+from baselines.console import notes, print_on_any_terminal
+
+__all__ = ["BAD_INPUT", "FAILED", "INTERRUPTED", "PLAN_OPTIONS", "app", "completed", "main"]
+
+for part in (looking, driving, measuring, learning, paper):
+    app.add_typer(part.commands)
+
+RESUMED = ("bench", "eval", "train", "tune")  # commands that go on where they were interrupted
+
+
+def main() -> None:
+    """Run the command line; invalid input ends in one line on stderr and exit status 2."""
+    print_on_any_terminal()
+    try:
+        status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
+    except TyperException as error:
+        fail(error.format_message(), error.exit_code)
+    except ValueError as error:
+        fail(str(error), BAD_INPUT)
+    except OSError as error:
+        fail(str(error), FAILED)
+    except (KeyboardInterrupt, typer.Abort):
+        fail(interrupted_message(sys.argv[1:]), INTERRUPTED)
+    else:
+        if status == INTERRUPTED:  # typer's status after Ctrl-C
+            fail(interrupted_message(sys.argv[1:]), INTERRUPTED)
+
+
+def interrupted_message(words: Sequence[str]) -> str:
+    """What is printed after Ctrl-C, with the command that goes on, if that can."""
+    if not words or words[0] not in RESUMED:
+        return "interrupted"
+    return f"interrupted; what is finished is kept, and the same command goes on: tlf {shlex.join(words)}"
+
+
+def fail(message: str, status: int) -> None:
+    """Print a message in one line, and exit."""
+    notes.print(f"tlf: {' '.join(message.split())}", soft_wrap=True)
+    sys.exit(status)
