@@ -285,6 +285,7 @@ CLAIMS: Sequence[Claim] = (
         "",
         _more_lost,
         Below(0.5),
+        digits=1,
     ),
 )
 

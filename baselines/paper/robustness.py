@@ -245,6 +245,7 @@ def _longest_claim(task: str, gains: str, few: int, reading: str) -> Claim:
         _longest(task, gains),
         Above(MOST_ROBOTS[task] - 0.5, few + 0.5),
         "robustness",
+        digits=1,
     )
 
 

@@ -233,7 +233,7 @@ def draw_map(data: Slip, axes: Any, figure: Figure) -> None:
     axes.set_yticks(range(len(MAP_ETAS)), [f"{eta:g}" for eta in MAP_ETAS])
     for (row, column), value in np.ndenumerate(data.map_mm):
         text = f"{value:.0f}" if np.isfinite(value) else "lost"
-        look = {"fontsize": 6.5, "color": "white" if value > 20 else "black"}
+        look = {"fontsize": 6.5, "color": "white" if 20 < value < np.inf else "0.2"}
         axes.text(np.log10(MAP_EPSILONS[column]), row, text, ha="center", va="center", **look)
     axes.plot(-1, 0, "s", mfc="none", color=GREEN, ms=15, mew=2)
     axes.set_xlabel("$\\log_{10} ε$")
