@@ -68,7 +68,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     },
     "tune": {"tlf tune adrc --trials 50": "a search of the gains; call it again to continue"},
     "paper": {
-        "tlf paper": "every figure and claim of the paper, into results/paper; a quarter of an hour",
+        "tlf paper": "every figure and claim of the paper, into results/paper; about three quarters of an hour",
         "tlf paper --figures fig7ab,fig7c": "the wheel loop only, half a minute",
     },
     "compile": {

@@ -26,7 +26,7 @@ SEEDS = tuple(range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + 10))
 SKID_AT_S, SKID_S = 40.0, 2.0
 BACK_RAD = 0.03  # about three times the error without slip
 LOST_MM = 1200.0
-SHOWN_S, DRAWN_EVERY = (35.0, 100.0), 5
+SHOWN_S, DRAWN_EVERY = (35.0, 100.0), 10
 
 
 def skid(channel: str, value: float) -> dict[str, Any]:

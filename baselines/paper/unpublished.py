@@ -114,7 +114,8 @@ def maps(data: Unpublished) -> Figure:
         for (row, column), value in np.ndenumerate(found):
             if np.isfinite(value):
                 look = {"fontsize": 6.5, "color": "white" if value > 10 else "black"}
-                axes.text(column, row, f"{value:.2g}", ha="center", va="center", **look)
+                text = f"{value:.0f}" if value >= 10 else f"{value:.1f}"
+                axes.text(column, row, text, ha="center", va="center", **look)
         axes.set_xticks(
             range(len(MAP_INERTIAS)), [f"{one:g}" for one in MAP_INERTIAS], fontsize=7.5
         )
@@ -243,6 +244,9 @@ PART = Part(
         "Ranges: a yaw inertia from that of a radius of gyration of 40 mm to 85 mm; others by what fits a "
         "robot of 156 mm. The centre of mass follows from the trail and the pivot, as the load shares are "
         "printed. The filter and the wheel loop run at 1 ms.",
+        "The yaw inertia decides most: up to 3000 kg·mm² the printed gains track ∞ with every trail of the "
+        "map. Our robot, at 6197 kg·mm², is not tracked with them. So the verdict on the printed gains is one "
+        "on our robot.",
         "The map has our other values, at a control period of 1 ms and with starts on the tangent. Red "
         "cross: our robot.",
     ),
