@@ -7,7 +7,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from generalisation_cells import BASE, CELLS, CLASSICAL, ENTRIES, LEARNED, Cell
+from generalisation_causes import CAUSES, key_of
+from generalisation_cells import BASE, CELLS, CLASSICAL, ENTRIES, LEARNED, MIXTURE, Cell
 from generalisation_kick import KICK, ROBOTS, SLIPPING
 from generalisation_runs import Line
 
@@ -35,6 +36,7 @@ TITLES = {
     "rows": "long rows",
 }
 MARKS = {"better": " +", "worse": " −"}
+MOST_PLACES = 5  # that are named
 BEST = "the best classical one"
 
 
@@ -203,12 +205,46 @@ def summary(lines: Lines) -> str:
         ]
         for name, title in TITLES.items()
     ]
+    mixed = {True: f"all under `{MIXTURE}`", False: "all others"}
+    rows += [
+        [
+            title,
+            *(
+                counted(one for cell, one in each if (cell.disturbance == MIXTURE) == wanted)
+                for each in found.values()
+            ),
+        ]
+        for wanted, title in mixed.items()
+    ]
     rows.append(["all", *(counted(one for _, one in each) for each in found.values())])
     head = [
         f"`{entry}` and {rival if rival == BEST else f'its base, `{rival}`'}"
         for entry, rival in RIVALS
     ]
     return table(["conditions", *head], rows)
+
+
+def holdable(lines: Lines) -> list[str]:
+    """The cells in which not every run of every entry fails."""
+    return [
+        cell.name
+        for cell in CELLS
+        if any(
+            len(lines[cell.name, e]["failed"]) < len(lines[cell.name, e]["rms_mm"]) for e in ENTRIES
+        )
+    ]
+
+
+def failures(lines: Lines) -> str:
+    """Failed runs of each entry over the cells that some entry holds, and where they are."""
+    names, rows = holdable(lines), []
+    for entry in ENTRIES:
+        lost = {name: len(lines[name, entry]["failed"]) for name in names}
+        runs = sum(len(lines[name, entry]["rms_mm"]) for name in names)
+        places = [f"{name}: {count}" for name, count in lost.items() if count]
+        few = "; ".join(places) if len(places) <= MOST_PLACES else f"{len(places)} cells"
+        rows.append([f"`{entry}`", f"{sum(lost.values())} of {runs}", few or "none"])
+    return table(["entry", "failed", "where"], rows, left=3)
 
 
 def losses(lines: Lines) -> str:
@@ -234,34 +270,29 @@ def losses(lines: Lines) -> str:
 # --- along the row -------------------------------------------------------------------------------
 
 
-def growth(line: Line, name: str) -> tuple[float, float]:
-    """Last robot over first follower, and the largest ratio of a follower to the one in front."""
-    followers = np.array(line[name][1:])
-    return float(followers[-1] / followers[0]), float(np.max(followers[1:] / followers[:-1]))
+def row_cells(line: Line) -> list[str]:
+    """Errors of the leader, of robot 1 and of the last one, and how they grow from robot 1 to the last."""
+    own, path = line["row_mm"], line["path_mm"]
+    return [
+        str(len(line["failed"])),
+        *(digits(own[place]) for place in (0, 1, -1)),
+        f"{own[-1] / own[1]:.2f}",
+        *(digits(path[place]) for place in (1, -1)),
+        f"{path[-1] / path[1]:.1f}",
+        f"{line['gain']:.2f}",
+    ]
 
 
 def row_table(lines: Lines) -> str:
     """Growth of the errors along the long rows."""
-    rows = []
-    for cell in CELLS:
-        if cell.table != "rows":
-            continue
-        for entry in ENTRIES:
-            line = lines[cell.name, entry]
-            row, path = growth(line, "row_mm"), growth(line, "path_mm")
-            rows.append(
-                [
-                    cell.name,
-                    f"`{entry}`",
-                    str(len(line["failed"])),
-                    *(digits(line["row_mm"][place]) for place in (0, 1, -1)),
-                    *(f"{value:.2f}" for value in row),
-                    *(digits(line["path_mm"][place]) for place in (1, -1)),
-                    *(f"{value:.2f}" for value in path),
-                ]
-            )
-    head = ["row", "entry", "failed", "leader", "first follower", "last"]
-    head += ["last / first", "largest step", "path: first", "last", "last / first", "largest step"]
+    rows = [
+        [cell.name, f"`{entry}`", *row_cells(lines[cell.name, entry])]
+        for cell in CELLS
+        if cell.table == "rows"
+        for entry in ENTRIES
+    ]
+    head = ["row", "entry", "failed", "position: leader", "robot 1", "last", "last / robot 1"]
+    head += ["path: robot 1", "last", "last / robot 1", "`time_gain`"]
     return table(head, rows, left=2)
 
 
@@ -285,13 +316,28 @@ def kick_table(lines: Lines) -> str:
     return table(head, rows)
 
 
+def cause_table(lines: Lines) -> str:
+    """What a change does to an entry, and the best entry without learning."""
+    rows = []
+    for cause in CAUSES:
+        for entry in cause.entries:
+            best = lines[cause.cell, best_classical(lines, cause.cell)]
+            same, other = lines[cause.cell, entry], lines[key_of(cause), entry]
+            texts = [error_text(line) for line in (same, other, best)]
+            rows.append([cause.cell, f"`{entry}`", cause.name, *texts])
+    head = ["cell", "entry", "change", "unchanged", "changed", "best classical"]
+    return table(head, rows, left=3)
+
+
 def tables(lines: Lines) -> dict[str, str]:
     """All tables by their names."""
     return {
         "seen": seen(),
         **{name: cells_table(lines, name) for name in SHOWN_TABLES},
         "summary": summary(lines),
+        "failures": failures(lines),
         "losses": losses(lines),
+        "causes": cause_table(lines),
         "row": row_table(lines),
         "kick": kick_table(lines),
     }
