@@ -269,7 +269,7 @@ def test_ice_on_the_right():
 
 
 def test_causes():
-    gap, place, torques, _ = causes.CAUSES
+    gap, place, torques, mixed = causes.CAUSES
 
     def after(cause, entry):
         return median_mm(causes.key_of(cause), entry)
@@ -278,6 +278,8 @@ def test_causes():
     assert not lost(causes.key_of(gap), "kanayama")
     assert after(place, "from-nothing") < 0.5 * median_mm(place.cell, "from-nothing")
     assert after(place, "residual") > 0.9 * median_mm(place.cell, "residual")
+    for entry in LEARNED:
+        assert after(mixed, entry) > median_mm(mixed.cell, "adrc")
     heavy = torques.cell
     assert after(torques, "residual") < min(median_mm(heavy, entry) for entry in CLASSICAL)
     quarter = after(torques, "from-nothing") / median_mm(heavy, "from-nothing")
