@@ -14,6 +14,7 @@ from benchmarl.environments import Task, TaskClass
 from torchrl.data import Composite
 from torchrl.envs import EnvBase, PettingZooWrapper
 
+from baselines.torchrl import FormationBatchEnv
 from tlf_env.common.presets import presets_folder
 from tlf_env.envs.parallel import parallel_env
 
@@ -28,8 +29,16 @@ class FormationTaskClass(TaskClass):
     def get_env_fun(
         self, num_envs: int, continuous_actions: bool, seed: int | None, device: Any
     ) -> Callable[[], EnvBase]:
-        """A function that makes one environment; BenchMARL itself makes ``num_envs`` of them."""
+        """A function that makes the environment: on the plant ``batch`` one for all ``num_envs`` formations.
+
+        On other plants it makes one formation, and BenchMARL calls it ``num_envs`` times.
+        """
         arguments = dict(self.config)
+        if arguments.get("plant") == "batch":
+            arguments.pop("render_mode", None)
+            return lambda: FormationBatchEnv(
+                formations=num_envs, seed=seed, device=device, **arguments
+            )
         return lambda: PettingZooWrapper(
             parallel_env(**arguments), return_state=True, seed=seed, device=device
         )
@@ -43,8 +52,8 @@ class FormationTaskClass(TaskClass):
         return False
 
     def has_render(self, env: EnvBase) -> bool:
-        """Whether ``config`` asks for frames."""
-        return self.config.get("render_mode") == "rgb_array"
+        """Whether ``config`` asks for frames; the plant ``batch`` has none."""
+        return self.config.get("plant") != "batch" and self.config.get("render_mode") == "rgb_array"
 
     def max_steps(self, env: EnvBase) -> int:
         """Control steps of an episode at most."""
@@ -64,11 +73,11 @@ class FormationTaskClass(TaskClass):
 
     def state_spec(self, env: EnvBase) -> Composite | None:
         """The true state of the formation, as ``"state"``."""
-        return Composite({"state": env.observation_spec["state"].clone()})
+        return Composite({"state": env.full_observation_spec_unbatched["state"].clone()})
 
     def action_spec(self, env: EnvBase) -> Composite:
         """The actions of the robots, as ``("robot", "action")``."""
-        return env.full_action_spec
+        return env.full_action_spec_unbatched
 
     def action_mask_spec(self, env: EnvBase) -> Composite | None:
         """None: every action is allowed at any time."""
@@ -99,7 +108,7 @@ class FormationTask(Task):
 
 def _entries(env: EnvBase, key: str) -> Composite:
     """The observation specs of one key, by group."""
-    specs = env.observation_spec
+    specs = env.full_observation_spec_unbatched
     return Composite(
         {
             group: Composite({key: specs[group, key].clone()}, shape=specs[group].shape)

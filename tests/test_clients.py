@@ -199,6 +199,86 @@ def test_torchrl_drives_the_single_environment(maker: str, ending: dict[str, Any
     assert over.sum() >= 2
 
 
+# TorchRL on the batch plant
+
+
+def batch_env(formations: int = 4, **fields: Any) -> Any:
+    needed("torchrl.envs")
+    from baselines.torchrl import FormationBatchEnv
+
+    return FormationBatchEnv("infinity", formations, **fields)
+
+
+@every_choice_of_infos
+@both_ends
+def test_torchrl_drives_the_batch(infos: Any, ending: dict[str, Any]) -> None:
+    env = batch_env(infos=infos, seed=1, staggered=False, **ending)
+    from torchrl.envs.utils import check_env_specs
+
+    check_env_specs(env)
+    rollout = env.rollout(60, break_when_any_done=False)["next"]
+    robots, over = rollout["robot"], rollout["done"].squeeze(-1)
+    assert over.sum() >= 8
+    lost = "lost_beyond_mm" in ending
+    assert (robots["terminated"][over].any(dim=1) == lost).all()
+    assert (rollout["terminated"].squeeze(-1) == robots["terminated"].any(dim=2).squeeze(-1)).all()
+    assert (robots["terminated"] ^ robots["truncated"])[over].all()
+    assert not robots["done"][~over].any()
+    keys = set(INFO_KEYS) if infos is True else set(infos or ())
+    assert set(robots.get("info", {}).keys()) == keys
+
+
+def test_torchrl_gets_what_the_batch_computes() -> None:
+    """Observations, rewards and state of each formation, over resets, as of the plant and of one formation."""
+    env = batch_env(3, seed=5, staggered=False, action="twist", **BRIEF)
+    import torch
+
+    plant = tlf_env.BatchPlant("infinity", 3, action="twist", **BRIEF)
+    plant.reset(5)
+    alone = tlf_env.parallel_env("infinity", plant="batch", action="twist", **BRIEF)
+    seen, own = env.reset(), alone.reset(seed=5)[0]
+    rng = np.random.default_rng(0)
+    for _ in range(70):
+        np.testing.assert_array_equal(seen["robot", "observation"].numpy(), plant.observations)
+        np.testing.assert_array_equal(seen["robot", "observation"][0], np.stack(list(own.values())))
+        np.testing.assert_array_equal(seen["state"][0], alone.state())
+        actions = rng.uniform(-0.2, 0.2, (3, 3, 2)).astype(np.float32)
+        seen["robot", "action"] = torch.from_numpy(actions)
+        stepped, seen = env.step_and_maybe_reset(seen)
+        plant.step(actions)
+        np.testing.assert_allclose(stepped["next", "robot", "reward"][..., 0], plant.rewards, 1e-6)
+        np.testing.assert_array_equal(stepped["next", "done"][:, 0], plant.ended)
+        plant.reset_finished()
+        own = alone.step(dict(zip(alone.possible_agents, actions[0], strict=True)))[0]
+        if not alone.agents:
+            own = alone.reset()[0]
+
+
+def test_torchrl_repeats_a_seed_and_goes_on_to_other_episodes() -> None:
+    first, second, third = (
+        batch_env(2, seed=seed, **(BRIEF | {"disturbance": "start"})).reset()["state"]
+        for seed in (3, 3, 4)
+    )
+    assert first.equal(second)
+    assert not first.equal(third)
+    env = batch_env(2, seed=3, **(BRIEF | {"disturbance": "start"}))
+    states = [env.reset()["state"] for _ in range(2)]
+    assert not states[0].equal(states[1])
+
+
+def test_torchrl_is_refused_what_the_batch_refuses() -> None:
+    needed("torchrl.envs")
+    with pytest.raises(ValueError, match="formations"):
+        batch_env(0)
+    with pytest.raises(TypeError, match="horizon"):
+        batch_env(2, horizon=3)
+    env = batch_env(2, seed=0, **BRIEF)
+    seen = env.reset()
+    seen["robot", "action"] = env.action_spec.rand()["robot", "action"] * float("nan")
+    with pytest.raises(ValueError, match="must be finite"):
+        env.step(seen)
+
+
 # BenchMARL
 
 

@@ -1,7 +1,7 @@
 """Write docs/paper.md and docs/paper/ from the folder of ``tlf paper``.
 
-``tlf paper --out results/paper``, which takes about three quarters of an hour, then ``python docs/figures/make_paper.py
-results/paper``. Both need the extra ``figures``.
+``tlf paper --out results/paper``, which takes about three quarters of an hour, then
+``python docs/figures/make_paper.py results/paper``. Both need the extra ``figures``.
 """
 
 from __future__ import annotations

@@ -1,0 +1,244 @@
+"""IPPO and MAPPO of BenchMARL on the ∞: the part "A critic with the truth" of ``docs/learning.md``.
+
+``python docs/figures/make_marl.py`` trains and judges every variant with 5 seeds; a training takes about 5
+minutes of a core. It needs the extra ``benchmarl``. It can be interrupted and goes on where it was: results
+are kept in ``results/marl`` until the simulation changes. ``--seeds N`` trains fewer, ``--only VARIANT`` one
+variant; ``--draw`` makes table and figure from ``docs/learning/marl.json`` alone.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from make_board import DOCS
+from make_parts import put
+from matplotlib.figure import Figure
+
+from baselines.runs.provenance import simulation_digest
+from baselines.runs.seed_ranges import FIRST_TABLE_SEED
+from baselines.runs.style import tidy
+from tlf_env.common.files import atomic
+
+PAGE, KEPT = DOCS / "learning.md", DOCS / "learning" / "marl.json"
+RUNS = DOCS.parent / "results" / "marl"
+FORMATIONS, STEPS, ROLLOUTS = 64, 128, 40  # of a rollout: formations and control steps
+ROBOTS, JUDGED, HORIZON_S, SETTLED_S = 3, 50, 60.0, 24.0
+SEEDS = 5
+# Algorithm, and whether the robots share one network.
+VARIANTS = {
+    "IPPO": ("Ippo", True),
+    "MAPPO": ("Mappo", True),
+    "IPPO, a network for each robot": ("Ippo", False),
+    "MAPPO, a network for each robot": ("Mappo", False),
+}
+STYLES = {
+    "IPPO": ("#0072B2", "-"),
+    "MAPPO": ("#D55E00", "--"),
+    "IPPO, a network for each robot": ("#009E73", "-."),
+    "MAPPO, a network for each robot": ("#000000", ":"),
+}
+
+
+def experiment(variant: str, seed: int) -> Any:
+    """A training of BenchMARL on its shipped task ``infinity``."""
+    import torch
+    from benchmarl import algorithms
+    from benchmarl.experiment import Experiment, ExperimentConfig
+    from benchmarl.models import MlpConfig
+
+    from baselines.benchmarl import FormationTask
+
+    torch.set_num_threads(1)
+    name, shared = VARIANTS[variant]
+    task = FormationTask.INFINITY.get_from_yaml()
+    task.config.update(horizon_s=66.0, infos=())
+    config = ExperimentConfig.get_from_yaml()
+    config.loggers, config.render, config.evaluation = [], False, False
+    config.share_policy_params = shared
+    config.max_n_iters, config.max_n_frames = ROLLOUTS, None
+    config.on_policy_n_envs_per_worker = FORMATIONS
+    config.on_policy_collected_frames_per_batch = FORMATIONS * STEPS
+    config.on_policy_minibatch_size, config.on_policy_n_minibatch_iters = 341, 10
+    config.lr, config.gamma, config.clip_grad_val = 1e-3, 0.99, 0.5
+    config.save_folder = str(RUNS)
+    algorithm = getattr(algorithms, f"{name}Config").get_from_yaml()
+    algorithm.entropy_coef, algorithm.lmbda = 0.0, 0.95
+    algorithm.scale_mapping = "biased_softplus_0.5"
+    network = MlpConfig(
+        num_cells=[64, 64], layer_class=torch.nn.Linear, activation_class=torch.nn.Tanh
+    )
+    return Experiment(
+        task=task,
+        algorithm_config=algorithm,
+        model_config=network,
+        critic_model_config=network,
+        seed=seed,
+        config=config,
+    )
+
+
+def trained(variant: str, seed: int) -> dict[str, Any]:
+    """Train and judge one seed: its curve, its errors, and the minutes it took."""
+    made, returns = experiment(variant, seed), []
+    log = made.logger.log_collection
+
+    def logged(*words: Any, **named: Any) -> Any:
+        value = log(*words, **named)
+        returns.append(float(value))
+        return value
+
+    made.logger.log_collection = logged
+    start = time.perf_counter()
+    made.run()
+    minutes = (time.perf_counter() - start) / 60
+    return {
+        "variant": variant,
+        "seed": seed,
+        "returns": returns,
+        "minutes": minutes,
+        "digest": simulation_digest(),
+        **{name: judged(made.policy, name) for name in ("nominal", "slip")},
+    }
+
+
+def judged(policy: Any, disturbance: str) -> dict[str, list[float]]:
+    """RMS error of the worst robot (mm) from 24 s on and whether the run failed, of 50 unseen seeds."""
+    import torch
+    from tensordict.nn import set_interaction_type
+    from torchrl.envs.utils import ExplorationType
+
+    from baselines.torchrl import FormationBatchEnv
+
+    env = FormationBatchEnv(
+        "infinity",
+        JUDGED,
+        staggered=False,
+        seed=FIRST_TABLE_SEED,
+        disturbance=disturbance,
+        action="tracking_twist",
+        horizon_s=HORIZON_S,
+        infos=("position_error_mm", "end"),
+    )
+    steps = env.plant.scenario.horizon_steps
+    squares, failed = np.zeros((JUDGED, ROBOTS)), np.zeros(JUDGED, dtype=bool)
+    with set_interaction_type(ExplorationType.DETERMINISTIC), torch.no_grad():
+        seen = env.reset()
+        for k in range(1, steps + 1):
+            seen = env.step(policy(seen))["next"]
+            # A formation that failed continues to the horizon, as in the benchmark.
+            failed |= seen["terminated"].numpy().ravel()
+            if k * env.plant.scenario.control_period_s > SETTLED_S:
+                squares += seen["robot", "info", "position_error_mm"].numpy() ** 2
+    count = round((HORIZON_S - SETTLED_S) / env.plant.scenario.control_period_s)
+    return {
+        "rms_mm": np.sqrt(squares.max(axis=1) / count).round(4).tolist(),
+        "failed": failed.astype(int).tolist(),
+    }
+
+
+def every_run(variants: list[str], seeds: int) -> list[dict[str, Any]]:
+    """Results of all trainings; those that are missing are trained and kept."""
+    RUNS.mkdir(parents=True, exist_ok=True)
+    found = []
+    for seed in range(seeds):
+        for variant in variants:
+            path = RUNS / f"{variant.replace(', ', '-').replace(' ', '_')}_{seed}.json"
+            if not path.is_file() or json.loads(path.read_text())["digest"] != simulation_digest():
+                result = trained(variant, seed)
+                with atomic(path, encoding="utf-8") as file:
+                    json.dump(result, file)
+            found.append(json.loads(path.read_text(encoding="utf-8")))
+            print(line(found[-1]), flush=True)
+    return found
+
+
+def line(one: dict[str, Any]) -> str:
+    """A training in one line."""
+    cells = [
+        f"{name} {np.median(one[name]['rms_mm']):.2f} mm, {sum(one[name]['failed'])} failed"
+        for name in ("nominal", "slip")
+    ]
+    return f"{one['variant']}, seed {one['seed']}: {'; '.join(cells)}; {one['minutes']:.1f} minutes"
+
+
+def interval(values: list[float]) -> str:
+    """Mean of the seeds' values with the 95 % interval of Student's t."""
+    from scipy.stats import t
+
+    mean, half = np.mean(values), 0.0
+    if len(values) > 1:
+        half = t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
+    return f"{mean:.2f} ± {half:.2f}"
+
+
+def table(found: list[dict[str, Any]]) -> str:
+    """A row for each variant: geometric mean of the medians, and failed runs."""
+    lines = [
+        "| variant | seeds | log₁₀ of the RMS error in mm, nominal | under `slip` | failed, nominal | "
+        "under `slip` | minutes |",
+        "|---|---:|---:|---:|---:|---:|---:|",
+    ]
+    for variant in VARIANTS:
+        runs = [one for one in found if one["variant"] == variant]
+        if not runs:
+            continue
+        logs = {
+            name: [float(np.log10(np.median(one[name]["rms_mm"]))) for one in runs]
+            for name in ("nominal", "slip")
+        }
+        failed = {name: sum(sum(one[name]["failed"]) for one in runs) for name in logs}
+        total = JUDGED * len(runs)
+        lines.append(
+            f"| {variant} | {len(runs)} | {interval(logs['nominal'])} | {interval(logs['slip'])} | "
+            f"{failed['nominal']} of {total} | {failed['slip']} of {total} | "
+            f"{np.median([one['minutes'] for one in runs]):.1f} |"
+        )
+    return "\n".join(lines)
+
+
+def draw(found: list[dict[str, Any]], path: Path) -> None:
+    """Mean return of a rollout's episodes against robot steps: the median of the seeds, and their range."""
+    figure = Figure(figsize=(7.0, 3.6), layout="constrained")
+    axes = figure.subplots()
+    for variant, (colour, dashes) in STYLES.items():
+        curves = [one["returns"] for one in found if one["variant"] == variant]
+        if not curves:
+            continue
+        values = np.array(curves)
+        steps = FORMATIONS * STEPS * ROBOTS * (1 + np.arange(values.shape[1])) / 1e6
+        axes.plot(steps, np.median(values, axis=0), color=colour, ls=dashes, label=variant)
+        axes.fill_between(
+            steps, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.15, lw=0
+        )
+    axes.set_xlabel("robot steps (millions)")
+    axes.set_ylabel("mean return of an episode")
+    axes.legend(fontsize=8, frameon=False)
+    tidy(axes)
+    with atomic(path, "wb") as file:
+        figure.savefig(file, format="png", dpi=120, facecolor="white")
+
+
+def main() -> None:
+    """Train, judge, and write table and figure."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--seeds", type=int, default=SEEDS)
+    parser.add_argument("--only", choices=VARIANTS)
+    parser.add_argument("--draw", action="store_true")
+    options = parser.parse_args()
+    if options.draw:
+        found = json.loads(KEPT.read_text(encoding="utf-8"))
+    else:
+        found = every_run([options.only] if options.only else list(VARIANTS), options.seeds)
+        with atomic(KEPT, encoding="utf-8") as file:
+            json.dump(found, file)
+    put(PAGE, table(found), "marl")
+    draw(found, DOCS / "learning" / "marl.png")
+
+
+if __name__ == "__main__":
+    main()
