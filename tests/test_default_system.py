@@ -10,7 +10,8 @@ pytest.importorskip("matplotlib")
 
 from baselines.policies.registry import fit_policy
 from baselines.tuning.config import load_tune
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller
+from tlf_env.onboard.controllers import controller
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 from tlf_env.task.scenario import load_scenario
 
 sys.path.insert(0, str(DOCS / "figures"))

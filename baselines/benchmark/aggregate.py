@@ -38,7 +38,7 @@ from baselines.benchmark.statistics import (
 )
 from tlf_env.common.files import atomic
 from tlf_env.disturbances.channels import CHANNELS
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 
 PROFILE_SCORES = np.linspace(0, 100, 101)
 # What the others are compared with: the default controller by both its names, or else the paper's, alone or in

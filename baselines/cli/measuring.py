@@ -27,7 +27,7 @@ from baselines.console import (
     whole_numbers,
     writable_folder,
 )
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 
 commands = typer.Typer()
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import typer
 
 from baselines.cli.app import completed
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 
 SCENARIO = typer.Argument(
     help="Preset (see `tlf list tasks`), YAML file, CSV file of waypoints t_s,x_mm,y_mm, or -: YAML from the "

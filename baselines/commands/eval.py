@@ -27,7 +27,7 @@ from baselines.console import listed, progress_bar, screen, warn_of_scenarios
 from baselines.pages.replay import write_comparison
 from baselines.runs.folders import LONGEST, NOT_IN_FOLDERS, REPLAY
 from baselines.runs.provenance import command_line
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 
 RESULTS = Path("results/eval")
 METRIC = "position_rmse_mm"

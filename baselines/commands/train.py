@@ -28,7 +28,7 @@ from baselines.training.search import FOUND_FILE, Trained, run_search, search_of
 from baselines.training.train import POLICY_FILE
 from baselines.training.train_seeds import train_seeds
 from tlf_env.common.files import atomic, read_json
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 
 DEFAULT_FILE = "default.json"  # score of the default system in the evaluation of the training
 

@@ -12,7 +12,8 @@ from baselines.policies.columns import find_columns
 from baselines.policies.memory import next_memory
 from tlf_env.common.presets import is_file_name
 from tlf_env.numerics.compiled import driver
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for, load_controller
+from tlf_env.onboard.controllers import controller_for, load_controller
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 from tlf_env.onboard.rejection import RejectionState, read_rejection_of, write_rejection_of
 from tlf_env.onboard.supervisor import Neighbour, Supervisor, SupervisorRow, supervisor_row
 from tlf_env.onboard.tracking import (

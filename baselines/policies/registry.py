@@ -26,7 +26,7 @@ from baselines.policies.systems import (
 )
 from tlf_env.common.digest import code_of
 from tlf_env.common.errors import install_command, suggestion
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 from tlf_env.onboard.parts import Policy, load_part, make_part
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import tracking_entries

@@ -16,8 +16,8 @@ from baselines.policies.reference import ReferencePolicy
 from tlf_env.common.errors import suggestion
 from tlf_env.common.presets import is_file_name, preset_names, preset_or_file
 from tlf_env.numerics.compiled import driver
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for, controller_names
-from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
+from tlf_env.onboard.controllers import controller_for, controller_names
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER, ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.limiters import Limiter, behind, limiter_files, load_limiter, own_limiter
 from tlf_env.onboard.parts import Policy, load_part
 from tlf_env.onboard.supervisor import Neighbour, SupervisorRow, supervisor_row

@@ -12,7 +12,7 @@ from baselines.policies.registry import fit_policy
 from baselines.runs.outcome import failed
 from baselines.runs.run import run_seeds
 from baselines.training.config import TrainConfig
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario
 

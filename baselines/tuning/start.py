@@ -18,7 +18,8 @@ from baselines.policies.systems import (
     parse_system,
 )
 from tlf_env.common.errors import one_line
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller
+from tlf_env.onboard.controllers import controller
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 from tlf_env.onboard.limiters import Limiter, behind, load_limiter, own_limiter
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario

@@ -21,7 +21,8 @@ from tlf_env.common.presets import (
     presets_folder,
     read_yaml,
 )
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_names, load_controller
+from tlf_env.onboard.controllers import controller_names, load_controller
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 
 WEIGHTS = ROOT / "baselines" / "policies" / "weights"
 TASKS = ("infinity", "flower")

@@ -12,11 +12,10 @@ from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative
 from tlf_env.common.presets import is_file_name, preset_names, read_preset_or_file
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
-from tlf_env.onboard.kinds import EstimatorKind
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER, EstimatorKind
 from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.onboard.tracking import Controller, can_lead
 
-DEFAULT_CONTROLLER = "linearised"
 SCENARIO_FIELDS = ("estimator", "ekf_slip", "ekf_gyro", "broadcast_smoothing_s")
 
 

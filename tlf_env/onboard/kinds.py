@@ -1,8 +1,10 @@
-"""The built-in estimators: names in scenarios and files, and codes in the compiled laws."""
+"""Names in scenarios and files: the default controller, the built-in estimators and their codes in the laws."""
 
 from __future__ import annotations
 
 from typing import Literal, get_args
+
+DEFAULT_CONTROLLER = "linearised"  # a preset in configs/controllers
 
 EstimatorKind = Literal["ekf", "ekf-slip", "ekf-gyro", "truth"]
 ESTIMATOR_KINDS: tuple[EstimatorKind, ...] = get_args(EstimatorKind)

@@ -30,10 +30,10 @@ from tlf_env.common.models import (
 )
 from tlf_env.common.presets import is_file_name, read_preset_or_file
 from tlf_env.disturbances.model import Disturbance
-from tlf_env.onboard.controllers import DEFAULT_CONTROLLER, controller_for
+from tlf_env.onboard.controllers import controller_for
 from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
-from tlf_env.onboard.kinds import ESTIMATOR_KINDS, EstimatorKind
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER, ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.limiters import DEFAULT_LIMITER, Limiter, load_limiter
 from tlf_env.onboard.observer import ObserverParameters
 from tlf_env.onboard.parts import is_part
