@@ -20,9 +20,9 @@ from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.task.scenario import load_scenario
 from tlf_env.task.trajectories import sample
 
-TASK, HORIZON_S = "infinity", 60.0
+TASK, HORIZON_S = "infinity", 100.0
 PERIODS_S = (0.001, 0.002, 0.005, 0.01)  # levels of the control period
-LEVELS, WALKS, SEED = 4, 20, 1
+LEVELS, WALKS, SEED = 4, 14, 1
 LEAST_MM, MOST_MM = 0.1, 1000.0  # errors are cut off here: a lost robot may be anywhere
 
 
