@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import re
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,6 +28,7 @@ from tlf_env.task.scenario import load_scenario
 NAMES = ["a", "b", "c"]
 TWIST = load_scenario(horizon_s=0.6)
 ENTRIES = list(tracking_entries(TWIST.preview_s))
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 KEPT = ("e_1_fine", "torque_l", "last_action_0")
 
 
@@ -288,3 +292,14 @@ class TestTraining:
             found, _, start, _ = envs.step(wanted)
             ended += int(start.sum())
         assert ended > 0
+
+    def test_the_page_has_the_tables_of_the_measured_runs(self, monkeypatch):
+        monkeypatch.syspath_prepend(str(DOCS / "figures"))
+        make_memory = importlib.import_module("make_memory")
+        page = (DOCS / "learning.md").read_text("utf-8")
+        kept = json.loads((DOCS / "learning" / "memory.json").read_text("utf-8"))
+        for name, table in (
+            ("probe", make_memory.probed_table(kept["probe"])),
+            ("memory", make_memory.judged_table(kept["judged"])),
+        ):
+            assert f"<!-- {name} -->\n{table}\n<!-- end of {name} -->" in page

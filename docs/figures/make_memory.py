@@ -1,4 +1,4 @@
-"""What a history is worth to a learned policy, and what it would be worth to be told the truth.
+"""What a history is worth to a learned policy, and what it would be worth to be given what is true.
 
 Writes ``docs/learning/memory.json`` and the tables of the section *Memory* of ``docs/learning.md``. It needs
 the extra ``train``. ``python docs/figures/make_memory.py`` makes the tables from the file. Before that:
@@ -6,8 +6,9 @@ the extra ``train``. ``python docs/figures/make_memory.py`` makes the tables fro
 ``probe`` drives the default system with drawn friction, payload and wheel errors, and fits networks that
 estimate these from the present observation and from histories.
 
-``train ARM`` trains the preset ``history`` with some seeds: as it is (``history``), without its history
-(``plain``), or without it and with the drawn numbers as further entries, which no robot can know (``truth``).
+``train ARM`` trains the preset ``history`` with some seeds and no evaluation: as it is (``history``), without
+its history (``plain``), or without it and with the drawn numbers as further entries, which no robot can know
+(``truth``).
 
 ``judge`` runs what was trained on seeds that nothing was tuned on.
 """
@@ -36,14 +37,14 @@ from baselines.runs.run import PolicyDriver, run_seeds
 from baselines.runs.seed_ranges import FIRST_TABLE_SEED
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import TrainConfig, level_of, load_config
+from baselines.training.export import export_policy
 from baselines.training.model import (
+    make_envs,
     make_model,
     rollout_steps,
     set_learning_rate,
     spread_out,
 )
-from baselines.training.scoring import ScenarioScore, overall_mm, score_scenario
-from baselines.training.train import POLICY_FILE, passed, train
 from tlf_env.common.files import atomic
 from tlf_env.disturbances.channels import number
 from tlf_env.engine.batch import BatchPlant
@@ -53,7 +54,7 @@ from tlf_env.task.scenario import Scenario, load_scenario
 PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "memory.json"
 TRAINED = Path("results/memory")
 ARMS = ("plain", "history", "truth")
-MODEL_FILE = "policy.zip"  # of the arm `truth`
+POLICY_FILE, MODEL_FILE = "policy.safetensors", "policy.zip"  # the latter of the arm `truth`
 HORIZON_S = 60.0
 CELLS = (
     "nominal",
@@ -63,13 +64,11 @@ CELLS = (
     "combined-hard",
     "calibration",
     "payload",
-    "payload@1.5",
     "ice",
     "ice@1.3",
     "split-ice",
     "split-ice-right",
     "patches",
-    "patches@1.17",
 )
 RESAMPLES = 4000
 
@@ -114,12 +113,12 @@ class TruthVecEnv(FormationVecEnv):
 
     def observations(self) -> np.ndarray:
         """As its base, and what is true."""
-        told = np.concatenate([truth(plant) for plant in self.plants])
-        return np.concatenate([super().observations(), told], axis=1)
+        known = np.concatenate([truth(plant) for plant in self.plants])
+        return np.concatenate([super().observations(), known], axis=1)
 
 
-class Told:
-    """A model that is told what is true in the runs of some seeds; it stays the same during a run."""
+class Informed:
+    """A model that is given what is true in the runs of some seeds; it stays the same during a run."""
 
     def __init__(self, model: Any, scenario: Scenario, seeds: Sequence[int]) -> None:
         plant = BatchPlant(scenario, len(seeds))
@@ -139,49 +138,39 @@ class Told:
         return actions, state
 
 
-def train_told(config: TrainConfig, seed: int, folder: Path) -> None:
-    """Train with what is true, and keep the model with the best score, as ``tlf train`` does."""
-    torch.set_num_threads(1)
-    tasks, shares = config.mixture()
-    envs = TruthVecEnv(tasks, config.formations, mixture=shares, infos=False)
-    model = make_model(config, envs, seed)
-    spread_out(model, envs, config.seeds[0])
-    best_mm = score_told(model, config, folder, np.inf)
-    while model.num_timesteps < config.robot_steps:
-        before = model.num_timesteps
-        set_learning_rate(model, config)
-        model.learn(rollout_steps(model), reset_num_timesteps=False, log_interval=None)
-        last = model.num_timesteps >= config.robot_steps
-        if last or passed(config.evaluation.every, before, model.num_timesteps):
-            best_mm = score_told(model, config, folder, best_mm)
-
-
-def score_told(model: Any, config: TrainConfig, folder: Path, best_mm: float) -> float:
-    """Score a model on the validation seeds and keep it if it is the best; returns the best score."""
-    seeds = range(*config.evaluation.seeds)
-    scores: dict[str, ScenarioScore] = {}
-    for place, scenario in config.evaluation_scenarios().items():
-        scores[", ".join(place)] = score_scenario(Told(model, scenario, seeds), scenario, seeds)
-    score_mm = overall_mm(scores)
-    print(f"{folder}, {model.num_timesteps / 1e6:.2f} M robot steps: {score_mm:.2f} mm", flush=True)
-    if score_mm < best_mm:
-        model.save(folder / MODEL_FILE)
-    return min(score_mm, best_mm)
+def config_of(arm: str) -> TrainConfig:
+    """The training of an arm."""
+    config = load_config("history")
+    if arm == "history":
+        return config
+    network = config.network.model_copy(update={"history": None})
+    return config.model_copy(update={"network": network})
 
 
 def train_arm(arm: str, seeds: Sequence[int], trained: Path) -> None:
-    """Train one of the arms with some seeds, one after another."""
-    config = load_config("history")
-    if arm != "history":
-        network = config.network.model_copy(update={"history": None})
-        config = config.model_copy(update={"network": network})
+    """Train an arm with some seeds, one after another, and keep the last policy of each."""
+    torch.set_num_threads(1)
+    config = config_of(arm)
+    tasks, shares = config.mixture()
+    scenario = next(iter(tasks.values()))[0]
     for seed in seeds:
         folder = trained / arm / f"seed_{seed}"
         folder.mkdir(parents=True, exist_ok=True)
+        envs = (
+            TruthVecEnv(tasks, config.formations, mixture=shares, infos=False)
+            if arm == "truth"
+            else make_envs(config, 1)
+        )
+        model = make_model(config, envs, seed)
+        spread_out(model, envs, config.seeds[0])
+        while model.num_timesteps < config.robot_steps:
+            set_learning_rate(model, config)
+            model.learn(rollout_steps(model), reset_num_timesteps=False, log_interval=None)
         if arm == "truth":
-            train_told(config, seed, folder)
+            model.save(folder / MODEL_FILE)
         else:
-            train(config, seed, folder)
+            about = {"training": {"arm": arm}, "seeds": {"learner": [seed]}}
+            export_policy(model, folder / POLICY_FILE, scenario, **about)
 
 
 def judge(trained: Path, runs: int) -> list[dict[str, Any]]:
@@ -222,7 +211,7 @@ def of_folder(
         update={"disturbance": scenario.disturbance, "horizon_s": scenario.horizon_s}
     )
     model = PPO.load(folder / MODEL_FILE, device="cpu")
-    return Told(model, needed, seeds), needed
+    return Informed(model, needed, seeds), needed
 
 
 class Difference(NamedTuple):
