@@ -24,6 +24,7 @@ from baselines.runs.run import run_policy, run_seeds
 from baselines.training.config import load_config
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import load_scenario
+from tlf_env.task.warn import without_warnings
 
 NAMES = ["a", "b", "c"]
 TWIST = load_scenario(horizon_s=0.6)
@@ -209,8 +210,9 @@ class TestTraining:
         history = History(observations=2, mean_of=3, entries=KEPT)
         fields = {"formations": 4, "infos": False, "seed": 3, "horizon_s": 0.3, "staggered": True}
         fields |= {"time_gap_s": 0.1, "preview_s": (0.02,)}
-        plain = FormationVecEnv("infinity", **fields)
-        envs = HistoryVecEnv("infinity", history=history, **fields)
+        with without_warnings():  # of robots that are too close, with so short a gap
+            plain = FormationVecEnv("infinity", **fields)
+            envs = HistoryVecEnv("infinity", history=history, **fields)
         names = list(tracking_entries((0.02,)))
         past, memory = Past(history, names), None
         rng, begun = np.random.default_rng(0), np.ones(envs.num_envs, dtype=bool)

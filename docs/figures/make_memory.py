@@ -178,6 +178,7 @@ def judge(trained: Path, runs: int) -> list[dict[str, Any]]:
     seeds, rows = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + runs), []
     learner = load_config("history").evaluation_scenarios()["infinity", "nominal"]
     for cell in CELLS:
+        print(cell, flush=True)
         disturbance, level = level_of(cell)
         scenario = load_scenario(
             "infinity", disturbance=disturbance, disturbance_level=level, horizon_s=HORIZON_S
@@ -192,7 +193,8 @@ def judge(trained: Path, runs: int) -> list[dict[str, Any]]:
                         "arm": arm,
                         "seed": folder.name,
                         "rms_mm": [
-                            max(one.position_rmse_mm for one in robots) for robots in records
+                            round(max(one.position_rmse_mm for one in robots), 4)
+                            for robots in records
                         ],
                         "failed": [bool(failed(robots)) for robots in records],
                     }
@@ -235,7 +237,8 @@ def difference(arm: np.ndarray, plain: np.ndarray) -> Difference:
 
     def median(mine: np.ndarray, theirs: np.ndarray, runs: np.ndarray) -> float:
         apart = arm[mine][:, np.newaxis][:, :, runs] - plain[theirs][np.newaxis][:, :, runs]
-        return float(np.nanmedian(apart))
+        both = apart[np.isfinite(apart)]
+        return float(np.median(both)) if len(both) else np.nan
 
     sizes = (len(arm), len(plain), arm.shape[1])
     drawn = [
@@ -257,7 +260,8 @@ def judged_table(rows: list[dict[str, Any]]) -> str:
             line.append(f"{shown} ({lost})" if lost else shown)
         for arm in ARMS[1:]:
             found = difference(held[arm], held["plain"])
-            line.append(f"{found.median:+.2f} [{found.low:+.2f}, {found.high:+.2f}]")
+            shown = f"{found.median:+.2f} [{found.low:+.2f}, {found.high:+.2f}]"
+            line.append(shown.replace("-", "−"))
         out.append(line)
     head = ["∞", "without", "history", "truth", "history − without", "truth − without"]
     return table(head, out)
