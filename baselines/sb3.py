@@ -265,6 +265,10 @@ class FormationVecEnv(VecEnv):
         rows = zip(*columns, strict=True)
         return [dict(zip(self._info_keys, row, strict=True)) for row in rows]
 
+    def begin_next(self, plant: int, mask: np.ndarray) -> None:
+        """Start the next episodes of the formations of a mask, of one of the plants."""
+        self.plants[plant].reset(mask=mask)
+
     def step_async(self, actions: np.ndarray) -> None:
         """Keep the actions, ``(num_envs, 2)``, for the step."""
         self._actions = (actions,)

@@ -88,6 +88,8 @@ class Card(Frozen):
             )
         if self.action == "residual" and self.estimator is None:
             raise ValueError("estimator must be named if the action is 'residual'")
+        if self.network.history is not None:
+            self.network.history.places(self.entries)
         return self
 
     @property

@@ -1,4 +1,4 @@
-"""Learned policies without their learning library: MLPs and LSTMs in compiled NumPy.
+"""Learned policies without their learning library: MLPs, with a history or an LSTM, in compiled NumPy.
 
 The result for a row of a batch has the same bits in every batch, so a formation drives the same run alone
 and in a batch. A matrix product of BLAS does not guarantee that: its order of summation depends on the
@@ -16,6 +16,7 @@ import numpy as np
 
 from baselines.policies.card import WEIGHTS, Loaded, read_policy
 from baselines.policies.columns import Columns
+from baselines.policies.history import Past
 from tlf_env.numerics.compiled import block, driver, law
 from tlf_env.onboard.limiters import Limiter
 from tlf_env.task.actions import ACTION_ENTRIES, ACTION_SIZE, LIMITED_KINDS, RANGED_KINDS
@@ -81,6 +82,7 @@ class LearnedPolicy:
         self.card, tensors, self.files = loaded
         self._columns: Columns | None = None  # of the observation; found at the first use
         network = self.card.network
+        self._past = None if network.history is None else Past(network.history, self.card.entries)
         self._squashed = network.head == "squashed_gaussian"
         self._activation = ACTIVATIONS[network.activation]
         self._normalisation = (
@@ -150,7 +152,7 @@ class LearnedPolicy:
     def predict(
         self,
         observation: np.ndarray,
-        state: LstmState | None = None,
+        state: Any = None,
         episode_start: np.ndarray | None = None,
         deterministic: bool = True,
     ) -> tuple[np.ndarray, Any]:
@@ -159,10 +161,10 @@ class LearnedPolicy:
         Parameters
         ----------
         state
-            With an LSTM: the state that the last call returned, None at the start. Otherwise passed
-            through.
+            With an LSTM or a history: the state that the last call returned, None at the start. Otherwise
+            passed through.
         episode_start
-            With an LSTM: True for the rows ``(row,)`` whose state is reset first. None: no row.
+            With a state: True for the rows ``(row,)`` whose state is reset first. None: no row.
         deterministic
             False draws from the policy's Gaussian. The draws come from one generator, seeded when the
             policy was loaded, so the same calls after a new load give the same draws.
@@ -171,7 +173,7 @@ class LearnedPolicy:
         -------
         tuple
             Actions ``(2,)`` or ``(row, 2)``, float32 in [−1, 1], and the next state: with an LSTM h
-            and c, each ``(1, row, unit)`` float32.
+            and c, each ``(1, row, unit)`` float32; with a history an array of it, ``(row, number)``.
 
         Raises
         ------
@@ -186,14 +188,20 @@ class LearnedPolicy:
                 f"the observation has the shape {observation.shape}; this policy takes "
                 f"{self.card.observation} observations of {self._columns.width} entries"
             )
-        rows = self._normalised(self._columns.take(np.atleast_2d(observation)))
+        seen = self._columns.take(np.atleast_2d(observation))
+        next_state: Any = state
+        if self._past is not None:
+            memory = self._past.memory(state, len(seen), episode_start)
+            next_state = self._past.after(memory, seen)
+            seen = self._past.joined(seen, memory)
+        rows = self._normalised(seen)
         if self._lstm is not None:
-            state = self._remembered(rows, state, episode_start)
-            rows = state[0][0]
+            next_state = self._remembered(rows, state, episode_start)
+            rows = next_state[0][0]
         for layer in self._hidden:
             rows = _through(rows, *layer, self._activation)
         action = self._chosen(rows) if deterministic else self._drawn(rows)
-        return (action[0] if observation.ndim == 1 else action), state
+        return (action[0] if observation.ndim == 1 else action), next_state
 
     def _normalised(self, rows: np.ndarray) -> np.ndarray:
         """Normalised as by VecNormalize, in float64, then float32."""

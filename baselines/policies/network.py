@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+from typing import Annotated, Literal, Self
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
+from baselines.policies.history import History
 from tlf_env.common.models import Frozen, Switch, Whole
 from tlf_env.task.actions import ACTION_SIZE
 
@@ -16,22 +17,31 @@ Size = Annotated[Whole, Field(ge=1)]
 
 
 class Network(Frozen):
-    """Normalisation, an LSTM, hidden layers and a linear head, in this order.
+    """A history, normalisation, an LSTM, hidden layers and a linear head, in this order.
 
     Names and shapes of the tensors: :meth:`shapes`. A weight is (out, in), as in torch.
     """
 
     hidden: tuple[Size, ...]  # sizes of the hidden layers
     activation: Literal["tanh", "relu"]  # after each of them
+    history: History | None = None  # None: it sees the present observation only
     lstm: Size | None = None  # size of its state; None without an LSTM
     head: Literal["gaussian", "squashed_gaussian"]  # squashed: tanh of the draw, as SAC does
     normalised: Switch = False  # whether observations are normalised as VecNormalize does
+
+    @model_validator(mode="after")
+    def _check(self) -> Self:
+        if self.history is not None and self.lstm is not None:
+            raise ValueError("history and lstm exclude each other; both are there")
+        return self
 
     def shapes(self, entries: int) -> dict[str, tuple[int, ...]]:
         """Shapes of all tensors by name, for an observation of so many entries.
 
         ``normalise.*`` are float64, as in VecNormalize; all others are float32.
         """
+        if self.history is not None:
+            entries += self.history.size(entries)
         shapes: dict[str, tuple[int, ...]] = {}
         if self.normalised:
             shapes |= {f"{NORMALISATION}{name}": (entries,) for name in ("mean", "var")}

@@ -15,6 +15,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from baselines.sb3 import FormationVecEnv
+from baselines.training.history import HistoryVecEnv
 from tlf_env.common.files import atomic
 
 TENSOR = "tensor:"  # marks a tensor's name in the tree of plain values
@@ -48,6 +49,8 @@ def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, notes: dict[
     for i, plant in enumerate(envs.plants):
         for name, array in plant.arrays._asdict().items():
             tensors[f"plant.{i}.{name}"] = torch.from_numpy(array)
+    if isinstance(envs, HistoryVecEnv):
+        tensors["history"] = torch.from_numpy(envs.memory)
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
     data = save(contiguous, metadata={"state": json.dumps(plain)})
     with atomic(path, "wb") as file:
@@ -73,6 +76,8 @@ def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, 
             for name, array in plant.arrays._asdict().items():
                 array[...] = tensors[f"plant.{i}.{name}"].numpy()
             plant._seeded[:] = True
+        if isinstance(envs, HistoryVecEnv):
+            envs.memory[...] = tensors["history"].numpy()
         envs.last_ends.extend(plain["last_ends"])
         kind, *rest = plain["numpy_generator"]
         keys = tensors["numpy_generator"].numpy()

@@ -10,6 +10,8 @@ from typing import Annotated, Any, Literal, Self
 
 from pydantic import Field, ValidationError, model_validator
 
+from baselines.data.episodes import entry_names
+from baselines.policies.history import History
 from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from baselines.runs.splits import check_choosing, check_training
@@ -46,6 +48,7 @@ class NetworkConfig(Frozen):
 
     hidden: Annotated[tuple[Count, ...], Field(max_length=4)] = (64, 64)
     activation: Literal["tanh", "relu"] = "tanh"
+    history: History | None = None  # earlier observations that it sees; PPO and SAC
     lstm: Count | None = None  # size of the LSTM's state; RecurrentPPO only
     initial_log_std: Number = -1.6
     action_gain: Positive = 0.1  # factor on the initial weights of the action: begin near 0
@@ -180,6 +183,12 @@ class TrainConfig(Frozen):
                 f"RecurrentPPO, and no other algorithm, needs network.lstm; got {self.network.lstm} "
                 f"with {self.algorithm}"
             )
+        if self.network.history is not None and self.network.lstm is not None:
+            raise ValueError("network.history and network.lstm exclude each other; both are given")
+        if self.imitation is not None and self.network.history is not None:
+            raise ValueError(
+                "imitation needs a network without history: its teacher and its data have none"
+            )
         if self.imitation is not None and self.algorithm != "PPO":
             raise ValueError(f"imitation needs algorithm PPO, got {self.algorithm}")
         if self.imitation is not None and self.imitation.data and self.imitation.rounds > 1:
@@ -203,8 +212,13 @@ class TrainConfig(Frozen):
         ):
             if "disturbance" in fields:
                 raise ValueError(f"{place}.disturbance must be left out; disturbances has them all")
-        self.mixture()
+        tasks, _ = self.mixture()
         self.evaluation_scenarios()
+        if self.network.history is not None:
+            try:
+                self.network.history.places(entry_names(next(iter(tasks.values()))[0]))
+            except ValueError as error:
+                raise ValueError(f"network.{error}") from error
         return self
 
     @model_validator(mode="after")

@@ -10,10 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from baselines.policies.card import WEIGHTS, Card, write_policy
-from baselines.policies.learned import load_policy
+from baselines.policies.learned import LearnedPolicy, load_policy
 from baselines.policies.network import Network
 from baselines.runs.provenance import installed_versions, versions
-from tlf_env.onboard.parts import Policy
+from baselines.training.history import ModelPolicy, history_of
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario
@@ -47,7 +47,8 @@ def export_policy(
     model
         SB3's PPO or SAC or sb3-contrib's RecurrentPPO with an ``MlpPolicy`` (``MlpLstmPolicy``, one
         layer): tanh or ReLU, no gSDE, actions in [−1, 1]². The statistics of a ``VecNormalize`` that
-        normalises observations are exported, too.
+        normalises observations are exported, too, and the history of a
+        :class:`~baselines.training.history.HistoryVecEnv`.
     path
         Ends in ``.safetensors``.
     scenario
@@ -119,6 +120,9 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
     for i, layer in enumerate(layers):
         tensors |= _dense(f"hidden.{i}", layer)
     tensors |= _dense("mean", mean)
+    history = history_of(model)
+    if history is not None and lstm is not None:
+        raise ValueError("a model with an LSTM and a history cannot be exported")
     normaliser = model.get_vec_normalize_env()
     normalised = normaliser is not None and normaliser.norm_obs
     if normalised:
@@ -131,6 +135,7 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
     network = Network(
         hidden=tuple(layer.out_features for layer in layers),
         activation="relu" if "ReLU" in activations else "tanh",
+        history=history,
         lstm=None if lstm is None else lstm.hidden_size,
         head="squashed_gaussian" if type(model).__name__ == "SAC" else "gaussian",
         normalised=normalised,
@@ -147,25 +152,26 @@ def _array(tensor: Any) -> np.ndarray:
     return array
 
 
-def _check_agreement(model: BaseAlgorithm, policy: Policy) -> None:
-    """Compare the actions of a few steps; some rows start a new episode in between.
+def _check_agreement(model: BaseAlgorithm, policy: LearnedPolicy) -> None:
+    """Compare the actions of a few steps, a whole history at least; some rows start anew in between.
 
     Raises
     ------
     ValueError
         if they differ by more than :data:`AGREEMENT`.
     """
-    normaliser = model.get_vec_normalize_env()
+    model_policy = ModelPolicy(model)
+    history = policy.card.network.history
+    remembered = 0 if history is None else history.observations * history.mean_of
     generator = np.random.default_rng(0)
-    shape = (CHECKED_ROWS, *model.observation_space.shape)
+    shape = (CHECKED_ROWS, len(policy.card.entries))
     state, theirs = None, None
-    for step in range(CHECKED_STEPS):
+    for step in range(CHECKED_STEPS + remembered):
         seen = np.clip(generator.normal(size=shape), -OBSERVATION_LIMIT, OBSERVATION_LIMIT)
         seen = seen.astype(np.float32)
-        start = generator.random(CHECKED_ROWS) < (1.0 if step == 0 else 0.3)
+        start = generator.random(CHECKED_ROWS) < (1.0 if step == 0 else 0.3 / (1 + remembered))
         action, state = policy.predict(seen, state, start, True)
-        seen_by_model = seen if normaliser is None else normaliser.normalize_obs(seen)
-        wanted, theirs = model.predict(seen_by_model, theirs, start, deterministic=True)
+        wanted, theirs = model_policy.predict(seen, theirs, start, deterministic=True)
         apart = float(np.abs(action - wanted).max())
         if not apart <= AGREEMENT:
             raise ValueError(

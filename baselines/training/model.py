@@ -12,6 +12,7 @@ from stable_baselines3 import PPO, SAC
 
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import TrainConfig
+from baselines.training.history import HistoryVecEnv
 from tlf_env.common.errors import install_command
 from tlf_env.task.warn import without_warnings
 
@@ -21,16 +22,21 @@ OFF_POLICY_STEPS = 64
 def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
     """All formations; every episode draws its disturbance from the config's. Gives no warning.
 
+    With a history in the network, their observations contain it.
+
     Raises
     ------
     ValueError
         if there are fewer seeds than formations.
     """
     tasks, shares = config.mixture()
+    history = config.network.history
+    given: dict[str, Any] = {"mixture": shares, "threads": threads, "infos": False}
     with without_warnings():
-        envs = FormationVecEnv(
-            tasks, config.formations, mixture=shares, threads=threads, infos=False
-        )
+        if history is None:
+            envs = FormationVecEnv(tasks, config.formations, **given)
+        else:
+            envs = HistoryVecEnv(tasks, config.formations, history=history, **given)
     first, end = config.seeds
     if end - first < config.formations:
         raise ValueError(
@@ -107,9 +113,9 @@ def spread_out(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
     for step in range(longest):
         actions, state = model.predict(seen, state, starts, deterministic=True)
         seen, _, starts, _ = envs.step(actions)
-        for plant, moments in zip(envs.plants, begin, strict=True):
+        for plant, moments in enumerate(begin):
             if (moments == step).any():
-                plant.reset(mask=moments == step)
+                envs.begin_next(plant, moments == step)
     envs.clear_statistics()
     model._last_obs = envs.observations()
     model._last_episode_starts = np.ones(envs.num_envs, dtype=np.bool_)

@@ -28,6 +28,7 @@ from baselines.training.checkpoint import read_checkpoint, write_checkpoint
 from baselines.training.config import TrainConfig
 from baselines.training.curve import TrainingProgress, write_curve
 from baselines.training.export import export_policy
+from baselines.training.history import ModelPolicy
 from baselines.training.imitation import imitate
 from baselines.training.model import (
     make_envs,
@@ -191,7 +192,7 @@ def evaluate_and_keep(
 ) -> None:
     """Evaluate the policy, and keep it if it is the best so far."""
     seeds = range(*config.evaluation.seeds)
-    scores = score_policy(model, config.evaluation_scenarios(), seeds)
+    scores = score_policy(ModelPolicy(model), config.evaluation_scenarios(), seeds)
     score_mm = overall_mm(scores)
     best_mm = min((one["score_mm"] for one in done.evaluations), default=math.inf)
     done.evaluations.append(
