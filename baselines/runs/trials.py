@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from tlf_env.common.errors import install_command
 
 STUDY_FILE = "study.db"
+CHOSEN = "choose_{}"  # attribute of the study for each finalist
 
 
 class TrialStore:
@@ -121,6 +122,22 @@ class TrialStore:
         else:  # Optuna takes the last intermediate value of a pruned trial
             handle.report(score, stopped_at)
             self.study.tell(number, state=optuna.trial.TrialState.PRUNED)
+
+    def finalists(self, count: int) -> list[int]:
+        """Numbers of the completed trials with the smallest scores, and of the start (trial 0)."""
+        done = sorted(self.trials("COMPLETE"), key=lambda trial: (trial.value, trial.number))
+        best = [trial.number for trial in done[:count]]
+        return best if 0 in best else [*best, 0]
+
+    def chosen(self, numbers: Iterable[int]) -> dict[int, dict[str, Any]]:
+        """What :meth:`choose` has stored of some finalists, by number."""
+        kept = self.study.user_attrs
+        keys = {number: CHOSEN.format(number) for number in numbers}
+        return {number: kept[key] for number, key in keys.items() if key in kept}
+
+    def choose(self, number: int, outcome: Mapping[str, Any]) -> None:
+        """Store the outcome of a finalist on the seeds that choose."""
+        self.study.set_user_attr(CHOSEN.format(number), dict(outcome))
 
 
 def optuna_package() -> Any:

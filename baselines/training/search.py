@@ -30,10 +30,7 @@ from tlf_env.task.neutral import scenario_hash
 
 SEARCH_FILE, FOUND_FILE = "search.json", "found.yaml"
 STUDY_NAME = "train"
-COURSES, CHOSEN = (
-    "courses",
-    "choose_{}",
-)  # attributes of a trial, and of the study for each finalist
+COURSES = "courses"  # attribute of a trial
 
 
 class TrialJob(NamedTuple):
@@ -235,18 +232,16 @@ class TrainingSearch:
 
     def finalists(self) -> list[int]:
         """Numbers of the best trials and of the start."""
-        best = [one.number for one in self.outcomes()[: self.search.finalists]]
-        return best if 0 in best else [*best, 0]
+        return self.store.finalists(self.search.finalists)
 
     def chosen(self) -> dict[int, Trained]:
-        """Outcomes of those finalists that were trained with the other seeds."""
-        kept = self.store.study.user_attrs
-        keys = {number: CHOSEN.format(number) for number in self.finalists()}
-        return {n: Trained(**kept[key]) for n, key in keys.items() if key in kept}
+        """What came of those finalists that were trained with the other seeds."""
+        found = self.store.chosen(self.finalists())
+        return {number: Trained(**kept) for number, kept in found.items()}
 
     def choose(self, outcome: Trained) -> None:
-        """Store the outcome of a finalist."""
-        self.store.study.set_user_attr(CHOSEN.format(outcome.number), outcome._asdict())
+        """Store what came of a finalist."""
+        self.store.choose(outcome.number, outcome._asdict())
 
 
 def run_search(

@@ -16,7 +16,7 @@ from tlf_env.task.neutral import scenario_hash
 
 SEARCH_FILE = "search.json"
 STUDY_NAME = "tune"
-SCORES, CHOSEN = "scores", "choose_{}"  # attributes of a trial, and of the study for each finalist
+SCORES = "scores"  # attribute of a trial
 
 
 class StoredStudy:
@@ -108,15 +108,13 @@ class StoredStudy:
 
     def finalists(self) -> list[int]:
         """Numbers of the best trials and of the start (trial 0)."""
-        best = [outcome.number for outcome in self.outcomes()[: self.config.choose.finalists]]
-        return best if 0 in best else [*best, 0]
+        return self.store.finalists(self.config.choose.finalists)
 
     def chosen(self) -> dict[int, Outcome]:
         """Outcomes on the choosing seeds of those finalists that have been run there."""
-        attributes = self.store.study.user_attrs
-        keys = {number: CHOSEN.format(number) for number in self.finalists()}
-        return {n: Outcome(**attributes[key]) for n, key in keys.items() if key in attributes}
+        found = self.store.chosen(self.finalists())
+        return {number: Outcome(**kept) for number, kept in found.items()}
 
     def choose(self, outcome: Outcome) -> None:
         """Store the outcome of a finalist on the choosing seeds."""
-        self.store.study.set_user_attr(CHOSEN.format(outcome.number), outcome._asdict())
+        self.store.choose(outcome.number, outcome._asdict())
