@@ -482,8 +482,8 @@ PART = Part(
         "Not published, and chosen here: the control period (the figures have 1 ms, the shortest; the "
         "tables have 20 ms, too), the start poses (300 mm apart behind the leader on the tangent, at "
         "rest), the castor's trail, radius and place, the yaw inertia and the centre of mass. “Adequate” "
-        "is taken as 20 mm RMS. With the printed gains the yaw inertia decides whether ∞ is tracked: see "
-        "what the paper does not print.",
+        "is taken as 20 mm RMS. With the printed gains the castor and the yaw inertia decide whether ∞ is "
+        "tracked: see what the paper does not print.",
         "J adds errors of both signs, so that they cancel; the second table has the integrals of the "
         "magnitudes.",
     ),
