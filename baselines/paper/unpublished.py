@@ -190,8 +190,8 @@ def _map(gains: str) -> Any:
         light, short = found[:, 0], found[np.array(MAP_TRAILS) <= 4.0]
         return Measured(
             100 * float(np.mean(found < ADEQUATE_MM)),
-            f"at {MAP_INERTIAS[0]:g} kg·mm²: {100 * float(np.mean(light < ADEQUATE_MM)):.0f} %; with a trail of "
-            f"up to 4 mm: {100 * float(np.mean(short < ADEQUATE_MM)):.0f} %",
+            f"at {MAP_INERTIAS[0]:g} kg·mm²: {100 * float(np.mean(light < ADEQUATE_MM)):.0f} %; with a "
+            f"trail of up to 4 mm: {100 * float(np.mean(short < ADEQUATE_MM)):.0f} %",
         )
 
     return measure
