@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import typer
 
 from baselines import cli
 from baselines.commands import demo
@@ -63,7 +64,7 @@ def test_the_picture_and_the_data_are_written(shown):
 def test_the_commands_that_come_next_exist(capsys, monkeypatch, tmp_path):
     """Each is a command of ``tlf`` with options and names that are allowed."""
     monkeypatch.chdir(tmp_path)
-    names = {command.name or command.callback.__name__ for command in cli.app.registered_commands}
+    names = set(typer.main.get_command(cli.app).commands)
     for line, _ in demo.NEXT:
         for command in line.split(";"):
             words = command.split()

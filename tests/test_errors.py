@@ -103,7 +103,8 @@ def complaint(kind: Any, data: Any) -> str | None:
             TypeAdapter(kind).validate_python(data)
     except ValidationError as error:
         line = one_line(error, kind)
-        assert line == " ".join(line.split())
+        assert line.isprintable()  # so it is one line
+        assert line == line.strip()
         return line
     return None
 
@@ -180,8 +181,16 @@ def test_any_unknown_key_is_named(key, data):
         return
     line = complaint(kind, changed(valid, (*path, key), 1.0))
     assert line is not None
-    printed = key if key.isprintable() and key.strip() else repr(key)
+    printed = key if key.isprintable() and key == key.strip() else repr(key)
     assert ".".join(map(str, (*path, printed)))[:50].strip() in line or repr(printed) in line
+
+
+@pytest.mark.parametrize("key", [" 0", "0 ", " ", "\u2003x", ""])
+def test_a_key_with_blanks_at_its_ends_is_quoted(key):
+    """Otherwise the message would not show what is wrong with it."""
+    line = complaint(Scenario, {**load_scenario("circle").model_dump(), key: 3})
+    assert line is not None
+    assert line.startswith(f"{key!r}: unknown key")
 
 
 @pytest.mark.parametrize(

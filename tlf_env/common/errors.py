@@ -189,7 +189,7 @@ def _placed(kind: Any, item: Any) -> _Found:
 def _key(part: object) -> str:
     """A key as it is printed in a path."""
     text = str(part)
-    if not text.isprintable() or not text.strip():
+    if not text.isprintable() or not text or text != text.strip():
         text = repr(text)
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
