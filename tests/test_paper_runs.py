@@ -16,7 +16,7 @@ pytest.importorskip("control")
 pytest.importorskip("matplotlib")
 pytest.importorskip("SALib")
 
-from baselines.paper import errors, filter, lanes, robustness, screening, slip, unpublished
+from baselines.paper import ekf, errors, lanes, robustness, screening, slip, unpublished
 from baselines.paper.results import read_results
 from baselines.policies.registry import fit_policy
 from baselines.runs.run import run_policy
@@ -189,9 +189,9 @@ def test_nees_and_nis_of_a_known_filter_have_their_means():
     shape = (3000, 2, 3)
     nees, nis = (chi2.rvs(n, size=shape, random_state=rng) for n in (3, 2))
     t_s = 0.02 * (1 + np.arange(shape[0]))
-    one = filter.Course(t_s, np.zeros(shape), np.ones(shape), nees, nis, np.zeros(shape))
-    by_name = {claim.name: claim for claim in filter.CLAIMS}
-    data = filter.Filter({"∞": one, "flower": one}, {})
+    one = ekf.Course(t_s, np.zeros(shape), np.ones(shape), nees, nis, np.zeros(shape))
+    by_name = {claim.name: claim for claim in ekf.CLAIMS}
+    data = ekf.Filter({"∞": one, "flower": one}, {})
     for name, mean in (("ekf-nees", 3), ("ekf-nis", 2)):
         found = by_name[name].measure(data)
         assert found.value == pytest.approx(mean, rel=0.03)
@@ -201,16 +201,16 @@ def test_nees_and_nis_of_a_known_filter_have_their_means():
 def test_the_return_from_a_skid_is_the_last_time_it_was_far():
     t_s = np.arange(0.5, 100.0, 0.5)
     for end, expected in ((45.0, 3.0), (41.0, 0.0), (200.0, math.inf)):
-        off = np.where((t_s > filter.SKID_AT_S) & (t_s < end), 0.1, 0.001)[:, None, None]
-        one = filter.Course(t_s, off, off, off, off, off)
-        assert filter.back_after_s(one) == expected
+        off = np.where((t_s > ekf.SKID_AT_S) & (t_s < end), 0.1, 0.001)[:, None, None]
+        one = ekf.Course(t_s, off, off, off, off, off)
+        assert ekf.back_after_s(one) == expected
 
 
 def test_a_course_has_the_errors_of_the_recorded_run():
     scenario = short()
-    found = filter.course(scenario)
+    found = ekf.course(scenario)
     policy = fit_policy("reference:consistent", scenario).policy
-    record = run_policy(scenario, policy, filter.SEEDS[0])
+    record = run_policy(scenario, policy, ekf.SEEDS[0])
     turn = record["estimated_theta_rad"] - record["theta_rad"]
     np.testing.assert_allclose(found.heading_rad[:, 0], turn[1:], atol=1e-12)
     np.testing.assert_array_equal(found.position_mm[:, 0], record["position_error_mm"][1:])

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.paper import (
-    filter,
+    ekf,
     follower,
     nyquist,
     portrait,
@@ -32,7 +32,7 @@ PARTS: dict[str, Part] = {
         nyquist,
         portrait,
         slip,
-        filter,
+        ekf,
         follower,
         proofs,
         tracks,
