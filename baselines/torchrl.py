@@ -141,7 +141,7 @@ class FormationBatchEnv(EnvBase):
             if seed is None:
                 seed = secrets.randbelow(MAX_SEED - self.plant.formations)
             self.plant.reset(seed)
-            self._first_seed = None if seed is None else seed + self.plant.formations
+            self._first_seed = seed + self.plant.formations  # of the next reset of all
         else:
             self.plant.reset(mask=mask.cpu().numpy().reshape(self.plant.formations))
         found = self._seen()

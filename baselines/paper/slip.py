@@ -447,7 +447,7 @@ PART = Part(
         "e₂ = k₃δ₂/u₁* with sin e₃ = 0, where λ does not see it. So (21) hardly rejects slip.",
         "What it does is to damp the heading: it adds η²k₃/ε = 0.43 1/s near e₃ = 0 to k₂/k₃, which is "
         "0.00007 1/s with the printed k₂. On the plant a hundred times the printed η keeps robots that slip "
-        "on ∞, which are lost without it (right), with an error of about δ₁/k₁ all the same.",
+        "on ∞, which are lost without it (right), with half of δ₁/k₁ at best.",
     ),
     compute=compute,
     draw=draw,
