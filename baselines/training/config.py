@@ -15,6 +15,7 @@ from baselines.policies.history import History
 from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import CHOOSING_SEEDS, TRAINING_SEEDS, check_seeds
 from baselines.runs.splits import check_choosing, check_training
+from baselines.training.sensor_layer import sensor_layer
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch, Whole
 from tlf_env.common.presets import beside, is_file_name, read_preset_or_file
@@ -49,6 +50,8 @@ class NetworkConfig(Frozen):
     hidden: Annotated[tuple[Count, ...], Field(max_length=4)] = (64, 64)
     activation: Literal["tanh", "relu"] = "tanh"
     history: History | None = None  # earlier observations that it sees; PPO and SAC
+    # A fixed first layer for raw sensors (baselines/training/sensor_layer.py); the critic sees the truth.
+    input: Literal["sensor"] | None = None
     lstm: Count | None = None  # size of the LSTM's state; RecurrentPPO only
     initial_log_std: Number = -1.6
     action_gain: Positive = 0.1  # factor on the initial weights of the action: begin near 0
@@ -63,6 +66,7 @@ class ImitationConfig(Frozen):
     controller: str = "tuned"  # gains of the reference, without its limits on accelerations
     robot_steps: Count = 600_000  # over all rounds
     rounds: Count = 1  # the reference drives in the first round, the network in the others
+    window: Count | None = None  # rounds that the network is fitted to, the last ones; None: all
     noise: NonNegative = 0.02  # on the actions, standard deviation
     epochs: Count = 10
     learning_rate: Positive = 1e-3
@@ -185,10 +189,13 @@ class TrainConfig(Frozen):
             )
         if self.network.history is not None and self.network.lstm is not None:
             raise ValueError("network.history and network.lstm exclude each other; both are given")
-        if self.imitation is not None and self.network.history is not None:
+        sensors = self.network.input == "sensor"
+        if self.imitation is not None and self.network.history is not None and not sensors:
             raise ValueError(
                 "imitation needs a network without history: its teacher and its data have none"
             )
+        if sensors:
+            self._check_sensors()
         if self.imitation is not None and self.algorithm != "PPO":
             raise ValueError(f"imitation needs algorithm PPO, got {self.algorithm}")
         if self.imitation is not None and self.imitation.data and self.imitation.rounds > 1:
@@ -217,9 +224,25 @@ class TrainConfig(Frozen):
         if self.network.history is not None:
             try:
                 self.network.history.places(entry_names(next(iter(tasks.values()))[0]))
+                if self.network.input == "sensor":
+                    for scenarios in tasks.values():
+                        sensor_layer(scenarios[0], self.network.history)
             except ValueError as error:
                 raise ValueError(f"network.{error}") from error
         return self
+
+    def _check_sensors(self) -> None:
+        """Check what a network with the input ``sensor`` needs, but for its scenario."""
+        wanted = {
+            "algorithm": ("PPO", self.algorithm),
+            "network.activation": ("relu", self.network.activation),
+            "imitation.data": (None, self.imitation.data if self.imitation else None),
+        }
+        for name, (needed, got) in wanted.items():
+            if got != needed:
+                raise ValueError(f"network.input sensor needs {name} {needed}, got {got}")
+        if self.network.history is None:
+            raise ValueError("network.input sensor needs network.history")
 
     @model_validator(mode="after")
     def _check_search(self) -> Self:

@@ -14,6 +14,7 @@ from baselines.policies.learned import LearnedPolicy, load_policy
 from baselines.policies.network import Network
 from baselines.runs.provenance import installed_versions, versions
 from baselines.training.history import ModelPolicy, history_of
+from baselines.training.sensor_policy import SensorPolicy
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario
@@ -112,14 +113,20 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
         for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
             tensors[f"lstm.{name}"] = _array(getattr(lstm, f"{name}_l0"))
     layers, activations = list(hidden)[::2], {type(one).__name__ for one in list(hidden)[1::2]}
+    plain = model.policy.plain_layers() if isinstance(model.policy, SensorPolicy) else None
     linear = all(type(layer).__name__ == "Linear" for layer in layers)
     if not linear or len(hidden) % 2 or activations not in (set(), {"Tanh"}, {"ReLU"}):
         raise ValueError(
             f"hidden layers must be linear with tanh or with ReLU, got {' '.join(str(hidden).split())}"
         )
-    for i, layer in enumerate(layers):
-        tensors |= _dense(f"hidden.{i}", layer)
-    tensors |= _dense("mean", mean)
+    if plain is not None:
+        *inner, last = plain
+        for name, dense in [*((f"hidden.{i}", one) for i, one in enumerate(inner)), ("mean", last)]:
+            tensors |= {f"{name}.weight": dense.weight, f"{name}.bias": dense.bias}
+    else:
+        for i, layer in enumerate(layers):
+            tensors |= _dense(f"hidden.{i}", layer)
+        tensors |= _dense("mean", mean)
     history = history_of(model)
     if history is not None and lstm is not None:
         raise ValueError("a model with an LSTM and a history cannot be exported")
@@ -133,7 +140,9 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
             "normalise.clip": np.array(normaliser.clip_obs),
         }
     network = Network(
-        hidden=tuple(layer.out_features for layer in layers),
+        hidden=tuple(
+            len(tensors[f"hidden.{i}.bias"]) for i in range(len(plain[:-1] if plain else layers))
+        ),
         activation="relu" if "ReLU" in activations else "tanh",
         history=history,
         lstm=None if lstm is None else lstm.hidden_size,

@@ -103,7 +103,10 @@ class ModelPolicy:
             )
             return answer
         memory = self._past.memory(state, len(observation), episode_start)
-        seen = self._normalised(self._past.joined(observation, memory))
+        joined = self._past.joined(observation, memory)
+        # What the environments add for the critic, the actor does not see.
+        more = self._model.observation_space.shape[0] - joined.shape[1]
+        seen = self._normalised(np.pad(joined, ((0, 0), (0, more))))
         actions, _ = self._model.predict(seen, deterministic=deterministic)
         return actions, self._past.after(memory, observation)
 

@@ -38,8 +38,7 @@ def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
     contain its corrections. The network is fitted to the teacher's actions, and the critic to the
     discounted rewards that followed. In further rounds the network drives, and the teacher's actions are
     computed for what the network observes; so the network learns to correct its own errors (DAgger: Ross,
-    Gordon, Bagnell, AISTATS 2011). The teacher has no limits on accelerations: with them its command is
-    the last command plus a small step, and a network that imitates this drifts away.
+    Gordon, Bagnell, AISTATS 2011).
 
     Raises
     ------
@@ -55,10 +54,7 @@ def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
         _fit(model, seen, meant, returns, wanted.epochs, wanted.learning_rate)
         return
     check_interface("the teacher", scenario, action="twist", observation="tracking")
-    known = controller(wanted.controller)
-    free = {"acceleration_mm_s2": None, "yaw_acceleration_rad_s2": None}
-    known = known.model_copy(update={"limits": known.limits.model_copy(update=free)})
-    teacher = ReferencePolicy(known, scenario.control_period_s, scenario.preview_s)
+    teacher = free_teacher(wanted.controller, scenario)
     generator = np.random.default_rng(model.seed)
     rows: list[Rows] = []
     for round_ in range(wanted.rounds):
@@ -68,6 +64,17 @@ def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
             torch.from_numpy(np.concatenate(one)) for one in zip(*rows, strict=True)
         )
         _fit(model, seen, meant, returns, wanted.epochs, wanted.learning_rate)
+
+
+def free_teacher(name: str, scenario: Scenario) -> ReferencePolicy:
+    """A controller without its limits on accelerations, as a policy from ``tracking`` to ``twist``.
+
+    With them its command depends on the one before, and a network that imitates it drifts away.
+    """
+    known = controller(name)
+    free = {"acceleration_mm_s2": None, "yaw_acceleration_rad_s2": None}
+    known = known.model_copy(update={"limits": known.limits.model_copy(update=free)})
+    return ReferencePolicy(known, scenario.control_period_s, scenario.preview_s)
 
 
 def _from_data(path: Path, scenario: Scenario, gamma: float) -> Rows:
@@ -113,14 +120,21 @@ def _drive(
         observations, rewards[k], dones[k], _ = envs.step(np.clip(given, -1.0, 1.0))
     model._last_obs = observations
     model._last_episode_starts = np.asarray(dones[-1])
-    returns = np.empty_like(rewards)
-    last = rewards[-steps // 4 :].mean() / (1.0 - model.gamma)  # as if the rewards stayed the same
-    following = np.full(envs.num_envs, last, dtype=np.float32)
-    for k in reversed(range(steps)):
-        following = rewards[k] + model.gamma * np.where(dones[k], 0.0, following)
-        returns[k] = following
+    returns = returns_of(rewards, dones, model.gamma)
     count = steps * envs.num_envs
     return Rows(seen.reshape(count, -1), meant.reshape(count, -1), returns.ravel())
+
+
+def returns_of(rewards: np.ndarray, dones: np.ndarray, gamma: float) -> np.ndarray:
+    """Discounted rewards that followed, (step, robot); after the last step as if rewards stayed the same."""
+    steps, robots = rewards.shape
+    returns = np.empty_like(rewards)
+    last = rewards[-steps // 4 :].mean() / (1.0 - gamma)
+    following = np.full(robots, last, dtype=np.float32)
+    for k in reversed(range(steps)):
+        following = rewards[k] + gamma * np.where(dones[k], 0.0, following)
+        returns[k] = following
+    return returns
 
 
 def _fit(

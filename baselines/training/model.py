@@ -13,6 +13,7 @@ from stable_baselines3 import PPO, SAC
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import TrainConfig
 from baselines.training.history import HistoryVecEnv
+from baselines.training.sensor_policy import SensorPolicy, SensorVecEnv
 from tlf_env.common.errors import install_command
 from tlf_env.task.warn import without_warnings
 
@@ -36,7 +37,8 @@ def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
         if history is None:
             envs = FormationVecEnv(tasks, config.formations, **given)
         else:
-            envs = HistoryVecEnv(tasks, config.formations, history=history, **given)
+            kind = SensorVecEnv if config.network.input == "sensor" else HistoryVecEnv
+            envs = kind(tasks, config.formations, history=history, **given)
     first, end = config.seeds
     if end - first < config.formations:
         raise ValueError(
@@ -60,7 +62,10 @@ def make_model(config: TrainConfig, envs: FormationVecEnv, seed: int) -> Any:
         "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network.activation],
         "log_std_init": network.initial_log_std,
     }
+    kind: Any
     make, kind = algorithm(config)
+    if isinstance(envs, SensorVecEnv):
+        kind, policy["layer"] = SensorPolicy, envs.layer
     if network.lstm is not None:
         policy |= {"lstm_hidden_size": network.lstm}
     if config.algorithm == "SAC":
@@ -77,6 +82,8 @@ def make_model(config: TrainConfig, envs: FormationVecEnv, seed: int) -> Any:
     with torch.no_grad():
         head.weight.mul_(network.action_gain)
         head.bias.mul_(network.action_gain)
+    if isinstance(model.policy, SensorPolicy):
+        model.policy.begin_at_reference()
     return model
 
 

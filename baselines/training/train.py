@@ -38,6 +38,7 @@ from baselines.training.model import (
     spread_out,
 )
 from baselines.training.scoring import overall_mm, score_policy
+from baselines.training.sensor_imitation import imitate_with_sensors
 from tlf_env.task.neutral import scenario_hash
 
 POLICY_FILE, CHECKPOINT_FILE, TRAINING_FILE = (
@@ -121,7 +122,9 @@ def _train(
         set_level(envs, config, done)
         spread_out(model, envs, config.seeds[0])
         if config.imitation is not None:
-            imitate(model, envs, config)
+            (imitate_with_sensors if config.network.input == "sensor" else imitate)(
+                model, envs, config
+            )
         evaluate()
     began = started - done.wall_time_s
     with interrupts() as stop:
