@@ -71,20 +71,20 @@ class Formations:
         self.ends = torch.randint(self.episode, (count,))  # so that later starts are spread
         self.vary(torch.ones(shape, dtype=torch.bool))
 
-    def begin(self, lanes: Tensor) -> None:
-        """Start an episode in some formations."""
+    def begin(self, lanes: Tensor, plain: bool = False) -> None:
+        """Start an episode in some formations; a plain one begins as the task does."""
         if not len(lanes):
             return
         self.clock[lanes], self.ends[lanes] = 0, self.episode
         self.route[lanes] = torch.randint(len(self.tables), (len(lanes),))
         phase = torch.randint(round(ROUTE_S / self.model.period), (len(lanes),))
-        self.phase[lanes] = torch.where(torch.rand(len(lanes)) < 0.5, phase, 0)
+        self.phase[lanes] = torch.where(torch.rand(len(lanes)) < (not plain) / 2, phase, 0)
         pose = self.tables[self.route[lanes], self.phase[lanes], :3][:, None].repeat(
             1, self.robots, 1
         )
         back = torch.arange(self.robots)[:, None] * torch.tensor([-self.spacing, 0.0])
         pose = driven(pose, back.expand(len(lanes), -1, -1), 1.0)
-        scattered = torch.rand(len(lanes), 1, 1) < 0.5
+        scattered = torch.rand(len(lanes), 1, 1) < (not plain) / 2
         pose += scattered * torch.randn(pose.shape) * torch.tensor(START)
         for kept in self.state:
             kept[lanes] = 0.0
@@ -110,10 +110,7 @@ class Formations:
 
     def between(self) -> None:
         """Between two windows: new episodes, other robots, and kicks."""
-        slot = self.step % self.ring
-        away = self.references[slot, ..., :2] - self.messages[slot, ..., :2]
-        lost = torch.hypot(*away.unbind(-1)) > self.lost
-        over = (self.clock >= self.ends) | lost.any(dim=-1)
+        over = (self.clock >= self.ends) | (self.away() > self.lost).any(dim=-1)
         self.state = State(*(one.detach().clone() for one in self.state))
         shape = (self.count, self.robots)
         missed = self.nature.slip - self.nature.estimate
@@ -126,6 +123,12 @@ class Formations:
         kick = torch.randn(*shape, 3) * torch.cat([size, size, size * KICK_RAD_MM], dim=-1)
         self.state.pose.add_((torch.rand(*shape, 1) < KICK) * kick)
         self.begin(over.nonzero()[:, 0])
+
+    def away(self) -> Tensor:
+        """Distances of the robots from their references."""
+        slot = self.step % self.ring
+        away = self.references[slot, ..., :2] - self.messages[slot, ..., :2]
+        return torch.hypot(*away.unbind(-1))
 
     def refer(self, lanes: Tensor, later: int) -> None:
         """The references of some formations ``later`` steps from now, as the robots' observers make them."""
@@ -275,7 +278,7 @@ def train(seed: int, folder: Path) -> None:
         if window % 100 == 0:
             error = torch.hypot(*(rows[:, :2] * model.scales[:2]).unbind(-1)).median()
             print(f"window {window}: median error {float(error):.1f} mm", flush=True)
-    save(policy, value, seed, folder, time.process_time() - began)
+    save(policy, seed, folder, time.process_time() - began)
 
 
 def learner() -> Scenario:
@@ -283,8 +286,8 @@ def learner() -> Scenario:
     return load_config("from-nothing").evaluation_scenarios()["infinity", "nominal"]
 
 
-def save(policy, value, seed, folder, took_s) -> None:
-    """Write the policy with its card, and the value for a training that goes on."""
+def save(policy: torch.nn.Sequential, seed: int, folder: Path, took_s: float) -> None:
+    """Write the policy with its card; the value is not kept."""
     folder.mkdir(parents=True, exist_ok=True)
     names = ("hidden.0", "hidden.1", "mean")
     dense = [layer for layer in policy if isinstance(layer, torch.nn.Linear)]
@@ -305,4 +308,3 @@ def save(policy, value, seed, folder, took_s) -> None:
         scores={},
         command=f"python docs/figures/make_differentiable.py train --seeds {seed}",
     )
-    torch.save(value.state_dict(), folder / "value.pt")
