@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import json
 import re
 import signal
@@ -9,14 +10,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from baselines import load_policy
 from baselines.data.episodes import RobotEpisode, entry_names
 from baselines.data.files import About, fitting_rows, read_rows, write_parquet
-from baselines.training.config import load_config
+from baselines.training.config import OfflineConfig, load_config
 from tlf_env.task.scenario import load_scenario
 
 pytest.importorskip("pyarrow")
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 
 FIELDS = {"action": "tracking_twist", "horizon_s": 2.0, "time_gap_s": 1.0, "preview_s": [0.5]}
 SCENARIO = load_scenario("infinity", plant="batch", **FIELDS)
@@ -369,3 +373,30 @@ class TestLearning:
     def test_settings_of_other_algorithms_are_refused(self, tmp_path):
         with pytest.raises(ValueError, match=r"settings\.buffer_size is not one of batch_size"):
             self.made(tmp_path, settings={"buffer_size": 10})
+
+
+class TestPage:
+    """What the documents say is what was measured."""
+
+    @pytest.fixture
+    def made(self, monkeypatch):
+        pytest.importorskip("stable_baselines3")
+        pytest.importorskip("matplotlib")
+        monkeypatch.syspath_prepend(str(DOCS / "figures"))
+        return importlib.import_module("make_offline")
+
+    def test_it_has_the_tables_of_the_measured_runs(self, made):
+        page = (DOCS / "learning.md").read_text("utf-8")
+        kept = json.loads(made.RESULTS.read_text("utf-8"))
+        for name, table in (
+            ("offline trainings", made.trained_table(kept["trainings"])),
+            ("offline", made.judged_table(kept["judged"])),
+        ):
+            assert f"<!-- {name} -->\n{table}\n<!-- end of {name} -->" in page
+
+    def test_the_training_of_the_page_on_trainings_can_be_read(self):
+        page = (DOCS / "training.md").read_text("utf-8")
+        text = page.partition("## From data alone")[2].partition("```yaml\n")[2]
+        config = load_config(yaml.safe_load(text.partition("```")[0]))
+        assert config.offline is not None
+        assert config.offline.alpha == OfflineConfig(data="x").alpha

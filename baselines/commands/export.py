@@ -79,7 +79,7 @@ def export_command(
     if form == "parquet":
         path = out / f"{name}.parquet"
         write_parquet(episodes, about, path)
-        use = f"imitation: {{data: {path}}} in a training's file"
+        use = f"imitation: {{data: {path}}} or offline: {{data: {path}}} in a training's file"
     else:
         space = parallel_env(scenario).observation_space("robot_0")
         write_minari(episodes, about, space, out, f"tlf_env/{name}-v0")

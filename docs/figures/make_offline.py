@@ -1,8 +1,8 @@
 """Offline learning from the data of a good and a mediocre controller, against both and against imitation.
 
-Writes ``docs/learning/offline.json`` and the tables of the section *Offline learning* of ``docs/learning.md``. It
-needs the extras ``train`` and ``data``. ``python docs/figures/make_offline.py`` makes the tables from the file.
-Before that, in this order:
+Writes ``docs/learning/offline.json`` and the tables of the section *Offline learning* of
+``docs/learning.md``. It needs the extras ``train`` and ``data``. ``python docs/figures/make_offline.py`` makes
+the tables from the file. Before that, in this order:
 
 ``data`` trains the mediocre controller and drives both, with noise on the actions of the mediocre one.
 
@@ -83,7 +83,7 @@ def config_of(arm: str) -> TrainConfig:
 
 
 def judge(runs: int) -> list[dict[str, Any]]:
-    """Position RMS of the worst robot, mm, and failures, of every run of every policy."""
+    """Position RMS of the worst robot, mm, and failures, of every run of every policy; kept after each cell."""
     seeds, rows = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + runs), []
     arms = {GOOD: [GOOD], MEDIOCRE: [str(MADE / MEDIOCRE / POLICY_FILE)]}
     for arm in ARMS:
@@ -105,7 +105,15 @@ def judge(runs: int) -> list[dict[str, Any]]:
                         "failed": [bool(failed(robots)) for robots in records],
                     }
                 )
+        keep({"trainings": trainings(), "judged": rows})
     return rows
+
+
+def keep(found: dict[str, Any]) -> None:
+    """Write what was found."""
+    with atomic(RESULTS, encoding="utf-8") as file:
+        json.dump(found, file, separators=(",", ":"))
+        file.write("\n")
 
 
 def trainings() -> list[dict[str, Any]]:
@@ -192,13 +200,11 @@ def main() -> None:
             return
         case ["judge"]:
             kept = {"trainings": trainings(), "judged": judge(given.runs)}
+            keep(kept)
         case []:
             pass
         case _:
             parser.error(f"{' '.join(given.what)!r} is none of data, train ARM, judge")
-    with atomic(RESULTS, encoding="utf-8") as file:
-        json.dump(kept, file, separators=(",", ":"))
-        file.write("\n")
     put(PAGE, trained_table(kept["trainings"]), "offline trainings")
     put(PAGE, judged_table(kept["judged"]), "offline")
 
