@@ -394,6 +394,21 @@ class TestPage:
         ):
             assert f"<!-- {name} -->\n{table}\n<!-- end of {name} -->" in page
 
+    def test_it_says_what_the_runs_show(self, made):
+        rows = json.loads(made.RESULTS.read_text("utf-8"))["judged"]
+        arms = (made.GOOD, made.MEDIOCRE, "imitation", "offline")
+        for cell in {row["cell"] for row in rows}:
+            held = {arm: made.held_mm(rows, cell, arm) for arm in arms}
+            each = {arm: np.nanmedian(one, axis=1) for arm, one in held.items()}
+            assert [len(each[arm]) for arm in arms] == [1, 1, 3, 3]
+            assert {one.shape[1] for one in held.values()} == {100}
+            middle = {arm: np.nanmedian(one) for arm, one in held.items()}
+            assert 2.0 * middle[made.GOOD] < middle["offline"] < middle[made.MEDIOCRE]
+            if cell.startswith("infinity"):
+                assert (each["offline"] < each["imitation"]).all()
+                found = made.difference(held["offline"], held["imitation"])
+                assert found.low < 0.0 < found.high
+
     def test_the_training_of_the_page_on_trainings_can_be_read(self):
         page = (DOCS / "training.md").read_text("utf-8")
         text = page.partition("## From data alone")[2].partition("```yaml\n")[2]

@@ -47,8 +47,12 @@ NOISE = 0.3  # on the actions of the mediocre controller
 ARMS = {"imitation": 0.0, "offline": None}  # α; None: the preset's
 HORIZON_S = 60.0
 CELLS = (
-    *(("infinity", one) for one in ("nominal", "slip", "start", "ice", "combined-hard")),
+    ("infinity", "nominal"),
+    ("infinity", "slip"),
+    ("infinity", "combined-hard"),
     ("flower", "nominal"),
+    ("infinity", "start"),
+    ("infinity", "ice"),
 )
 
 
@@ -82,14 +86,21 @@ def config_of(arm: str) -> TrainConfig:
     return config if alpha is None else config.with_values({"offline.alpha": alpha})
 
 
-def judge(runs: int) -> list[dict[str, Any]]:
-    """Position RMS of the worst robot, mm, and failures, of every run of every policy; kept after each cell."""
-    seeds, rows = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + runs), []
+def judge(runs: int, rows: list[dict[str, Any]]) -> None:
+    """Position RMS of the worst robot, mm, and failures, of every run of every policy; kept after each cell.
+
+    Cells of which ``rows`` has as many runs already are not run again.
+    """
+    seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + runs)
+    known = {row["cell"] for row in rows if len(row["rms_mm"]) == runs}
+    rows = [row for row in rows if row["cell"] in known]
     arms = {GOOD: [GOOD], MEDIOCRE: [str(MADE / MEDIOCRE / POLICY_FILE)]}
     for arm in ARMS:
         arms[arm] = [str(one) for one in sorted((MADE / arm).glob(f"seed_*/{POLICY_FILE}"))]
     for task, disturbance in CELLS:
         print(task, disturbance, flush=True)
+        if f"{task}, {disturbance}" in known:
+            continue
         scenario = load_scenario(task, disturbance=disturbance, horizon_s=HORIZON_S, plant="batch")
         for arm, policies in arms.items():
             for number, name in enumerate(policies):
@@ -106,7 +117,6 @@ def judge(runs: int) -> list[dict[str, Any]]:
                     }
                 )
         keep({"trainings": trainings(), "judged": rows})
-    return rows
 
 
 def keep(found: dict[str, Any]) -> None:
@@ -137,10 +147,13 @@ def trainings() -> list[dict[str, Any]]:
 
 
 def judged_table(rows: list[dict[str, Any]]) -> str:
-    """A row for each cell: medians and failed runs of every arm, and differences of the last one."""
+    """A row for each cell that was driven: medians and failed runs of the arms, and differences of the last."""
     out = []
     arms = (GOOD, MEDIOCRE, *ARMS)
+    driven = {row["cell"] for row in rows}
     for task, disturbance in CELLS:
+        if f"{task}, {disturbance}" not in driven:
+            continue
         held = {arm: held_mm(rows, f"{task}, {disturbance}", arm) for arm in arms}
         line = [f"{'∞' if task == 'infinity' else task}, `{disturbance}`"]
         for arm in arms:
@@ -189,6 +202,9 @@ def main() -> None:
     parser.add_argument("what", nargs="*", help="data; train ARM; judge; nothing: the tables alone")
     parser.add_argument("--seeds", default="0,1,2", help="of the trainings")
     parser.add_argument("--runs", type=int, default=100, help="of each cell")
+    parser.add_argument(
+        "--more", action="store_true", help="go on with the cells that are not kept"
+    )
     given = parser.parse_args()
     kept = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else {}
     match given.what:
@@ -199,8 +215,8 @@ def main() -> None:
             train_arm(arm, [int(seed) for seed in given.seeds.split(",")])
             return
         case ["judge"]:
-            kept = {"trainings": trainings(), "judged": judge(given.runs)}
-            keep(kept)
+            judge(given.runs, kept.get("judged", []) if given.more else [])
+            kept = json.loads(RESULTS.read_text("utf-8"))
         case []:
             pass
         case _:
