@@ -55,6 +55,19 @@ def test_an_episode_is_what_the_environment_returns():
     assert [one.truncated for one in episodes] == list(truncated.values()) == [True] * 3
 
 
+def test_noise_is_on_the_actions_of_the_data_and_drives_the_robots():
+    scenario = load_scenario("circle", horizon_s=0.4)
+    plain, noisy, again = (
+        robots_of(scenario, ReferencePolicy(), 4, noise=noise) for noise in (0.0, 0.02, 0.02)
+    )
+    first = np.array([one.actions[0] for one in noisy]) - [one.actions[0] for one in plain]
+    drawn = 0.02 * np.random.default_rng(4).standard_normal(first.shape)
+    np.testing.assert_allclose(first, drawn, atol=1e-6)
+    for mine, theirs in zip(noisy, again, strict=True):
+        np.testing.assert_array_equal(mine.actions, theirs.actions)
+    assert np.abs(noisy[0].observations[2:] - plain[0].observations[2:]).max() > 0.001
+
+
 def test_a_robot_that_is_lost_ends_every_episode():
     class Away:
         def predict(self, rows, state=None, episode_start=None, deterministic=True):
@@ -218,6 +231,8 @@ def test_without_the_packages_the_extra_is_named(monkeypatch, capsys):
     [
         (["circle", "--form", "csv"], "--form 'csv' must be one of parquet, minari"),
         (["circle", "--seeds", "3"], "3"),
+        (["circle", "--noise", "-1"], "--noise -1 must be a finite number from 0 on"),
+        (["circle", "--noise", "nan"], "--noise nan must be a finite number from 0 on"),
         (["circl"], "did you mean 'circle'?"),
         (["circle,flower", "--joint"], "--joint needs tasks with the same number of robots"),
     ],

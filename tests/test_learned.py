@@ -38,6 +38,7 @@ NETWORKS = {
     "relu": Network(hidden=(32,), activation="relu", head="gaussian"),
     "linear": Network(hidden=(), activation="tanh", head="gaussian"),
     "squashed": Network(hidden=(48, 16), activation="relu", head="squashed_gaussian"),
+    "tanh of the mean": Network(hidden=(24,), activation="relu", head="tanh"),
     "normalised": Network(hidden=(64, 64), activation="tanh", head="gaussian", normalised=True),
     "lstm": Network(hidden=(16,), activation="tanh", lstm=24, head="gaussian", normalised=True),
 }
@@ -88,6 +89,8 @@ def straightforward(network, t, rows, state, start):
     mean = x @ t["mean.weight"].T + t["mean.bias"]
     if network.head == "gaussian":
         return mean, np.broadcast_to(t["log_std"], mean.shape), state
+    if network.head == "tanh":
+        return mean, None, state
     return mean, x @ t["log_std.weight"].T + t["log_std.bias"], state
 
 

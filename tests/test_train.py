@@ -68,7 +68,10 @@ def test_shipped_configs_are_valid(path: Path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"algorithm": "A2C"}, "algorithm: Input should be 'PPO', 'SAC' or 'RecurrentPPO'"),
+        (
+            {"algorithm": "A2C"},
+            "algorithm: Input should be 'PPO', 'SAC', 'RecurrentPPO' or 'TD3BC'",
+        ),
         ({"robot_steps": 0}, "robot_steps: Input should be greater than or equal to 1, got 0"),
         ({"rollouts": 3}, "rollouts: unknown key"),
         (

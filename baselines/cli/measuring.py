@@ -399,6 +399,9 @@ def export(
     ] = "nominal",
     seeds: Annotated[str, typer.Option(help="Seeds FIRST:END; END itself is not run.")] = "0:20",
     horizon_s: Annotated[float | None, typer.Option(help="Length of each episode, s.")] = None,
+    noise: Annotated[
+        float, typer.Option(help="Standard deviation of normal noise on the policy's actions.")
+    ] = 0.0,
     form: Annotated[str, typer.Option(help="parquet (a plain table) or minari.")] = "parquet",
     joint: Annotated[
         bool,
@@ -419,6 +422,7 @@ def export(
         policy,
         seeds,
         horizon_s=horizon_s,
+        noise=noise,
         form=form,
         joint=joint,
         name=name,

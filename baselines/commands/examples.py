@@ -59,6 +59,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     },
     "export": {
         "tlf export infinity --policy reference --seeds 0:20 --out data": "20 runs as an offline data set",
+        "tlf export infinity --policy from-nothing --noise 0.3 --out data": "with noise on the actions",
     },
     "train": {
         "tlf train quick": "a few minutes, into results/train/quick",

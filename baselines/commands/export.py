@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 
 from baselines.benchmark.plan import parse_seeds
@@ -24,6 +25,7 @@ def export_command(
     seeds: str,
     *,
     horizon_s: float | None,
+    noise: float,
     form: str,
     joint: bool,
     name: str,
@@ -39,6 +41,8 @@ def export_command(
     """
     if form not in FORMS:
         raise ValueError(f"--form {form!r} must be one of {', '.join(FORMS)}")
+    if not (math.isfinite(noise) and noise >= 0):
+        raise ValueError(f"--noise {noise:g} must be a finite number from 0 on")
     first, end = parse_seeds(seeds)
     fitted = [
         fit_policy(policy, load_scenario(task, disturbance=one, horizon_s=horizon_s), trust=trust)
@@ -60,13 +64,14 @@ def export_command(
         control_period_s=scenario.control_period_s,
         scenario=str(scenario),
         versions=versions(),
+        noise=noise,
     )
     compile_before_first_run()
     episodes = []
     formations = len(fitted) * (end - first)
     with progress_bar("export") as update:
         pairs = [(one.scenario, one.policy) for one in fitted]
-        for one in collected(pairs, range(first, end), policy, joint=joint):
+        for one in collected(pairs, range(first, end), policy, joint=joint, noise=noise):
             episodes.append(one)
             per_formation = 1 if joint else scenario.robot_count
             update(min(len(episodes) // per_formation, formations), formations)
@@ -74,7 +79,7 @@ def export_command(
     if form == "parquet":
         path = out / f"{name}.parquet"
         write_parquet(episodes, about, path)
-        use = f"imitation: {{data: {path}}} in a training's file"
+        use = f"imitation: {{data: {path}}} or offline: {{data: {path}}} in a training's file"
     else:
         space = parallel_env(scenario).observation_space("robot_0")
         write_minari(episodes, about, space, out, f"tlf_env/{name}-v0")

@@ -40,9 +40,15 @@ def entry_names(scenario: Scenario) -> list[str]:
 
 
 def robots_of(
-    scenario: Scenario, policy: Policy, seed: int, name: str = "policy"
+    scenario: Scenario, policy: Policy, seed: int, name: str = "policy", noise: float = 0.0
 ) -> list[RobotEpisode]:
     """An episode for each robot of one formation, driven by a policy in the parallel environment.
+
+    Parameters
+    ----------
+    noise
+        Standard deviation of normal noise on the actions, from 0 on, drawn anew in each step from a generator
+        with the seed. The episode has the actions with it, within ±1.
 
     Raises
     ------
@@ -55,10 +61,13 @@ def robots_of(
     seen, acted, rewarded = [np.stack([found[one] for one in agents])], [], []
     state, start = None, np.ones(len(agents), dtype=np.bool_)
     ends: dict[str, tuple[bool, bool]] = {}
+    generator = np.random.default_rng(seed)
     shape = (len(agents), env.action_space(agents[0]).shape[0])
     while env.agents:
         answer = policy.predict(seen[-1], state, start, True)
         actions, state = predicted(answer, shape, f"policy {name!r}")
+        if noise:
+            actions = actions + noise * generator.standard_normal(shape)
         actions = np.clip(actions, -1.0, 1.0).astype(np.float32)
         start = np.zeros_like(start)
         found, rewards, terminated, truncated, _ = env.step(dict(zip(agents, actions, strict=True)))
@@ -99,12 +108,17 @@ def together(robots: Sequence[RobotEpisode]) -> RobotEpisode:
 
 
 def collected(
-    scenarios: Sequence[tuple[Scenario, Policy]], seeds: Sequence[int], name: str, *, joint: bool
+    scenarios: Sequence[tuple[Scenario, Policy]],
+    seeds: Sequence[int],
+    name: str,
+    *,
+    joint: bool,
+    noise: float = 0.0,
 ) -> Iterator[RobotEpisode]:
     """Episodes of every scenario and seed, those of a formation one after another."""
     for scenario, policy in scenarios:
         for seed in seeds:
-            robots = robots_of(scenario, policy, seed, name)
+            robots = robots_of(scenario, policy, seed, name, noise)
             if joint:
                 yield together(robots)
             else:

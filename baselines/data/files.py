@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 import os
 import warnings
@@ -12,15 +13,31 @@ from typing import Any, NamedTuple
 
 import gymnasium
 import numpy as np
+import yaml
 
-from baselines.data.episodes import RobotEpisode
+from baselines.data.episodes import RobotEpisode, entry_names
+from baselines.policies.card import interface
 from tlf_env.common.errors import install_command, path_text
 from tlf_env.common.files import atomic
+from tlf_env.onboard.parts import is_part
+from tlf_env.task.scenario import Scenario, load_scenario
 
 MINARI_FOLDER = "MINARI_DATASETS_PATH"  # the variable by which Minari finds its data sets
 ABOUT = b"tlf_env"  # key of the metadata in a Parquet file
 PLACE = ("episode", "task", "disturbance", "seed", "robot", "step")
 OUTCOME = ("reward", "terminated", "truncated")
+# What decides which twist an action is: fields of a scenario, and of what `interface` says of it.
+ACTION_FIELDS = (
+    "action",
+    "action_range",
+    "tracking_fade_mm",
+    "limiter",
+    "residual_base",
+    "residual_fade_mm",
+    "residual_reach_mm",
+    "control_period_s",
+)
+ACTION_MEANING = ("action_scales", *ACTION_FIELDS[2:])
 
 
 class About(NamedTuple):
@@ -33,6 +50,7 @@ class About(NamedTuple):
     control_period_s: float
     scenario: str  # the first one, as YAML
     versions: dict[str, str]
+    noise: float = 0.0  # standard deviation of what was added to the policy's actions
 
 
 class Rows(NamedTuple):
@@ -41,8 +59,29 @@ class Rows(NamedTuple):
     observations: np.ndarray  # (step, entry)
     actions: np.ndarray  # (step, 2)
     rewards: np.ndarray  # (step,)
-    last: np.ndarray  # (step,): whether its episode ends with the step
+    next_observations: np.ndarray  # (step, entry), after the action
+    terminated: np.ndarray  # (step,): whether the robot is lost or has touched; nothing follows
+    last: np.ndarray  # (step,): whether its episode ends with the step, terminated or truncated
+    tasks: tuple[str, ...]  # that occur, sorted; so the next ones
+    disturbances: tuple[str, ...]
+    seeds: tuple[int, ...]
     about: About
+    file: str  # its name, without its folder
+    sha256: str  # of its content
+
+    def origin(self) -> dict[str, Any]:
+        """Where the data come from, as JSON values."""
+        return {
+            "file": self.file,
+            "sha256": self.sha256,
+            "policy": self.about.policy,
+            "noise": self.about.noise,
+            "tasks": list(self.tasks),
+            "disturbances": list(self.disturbances),
+            "seeds": [self.seeds[0], self.seeds[-1] + 1],  # first, end
+            "steps": len(self.actions),
+            "versions": self.about.versions,
+        }
 
 
 def write_parquet(episodes: Sequence[RobotEpisode], about: About, path: Path) -> None:
@@ -92,35 +131,119 @@ def _apart(episode: RobotEpisode) -> list[RobotEpisode]:
 
 
 def read_rows(path: Path) -> Rows:
-    """The steps of a Parquet file that :func:`write_parquet` wrote, without the last observations.
+    """The steps of a Parquet file that :func:`write_parquet` wrote, each with the observation after it.
 
     Raises
     ------
     ValueError
-        in one line, for a file that cannot be read or is no such data set, and without pyarrow.
+        in one line, for a file that cannot be read or is no such data set, for one that lacks a column, a
+        step or the observation after a step, or holds a number that is not finite, and without pyarrow.
     """
-    _, pq = _arrow()
+    pa, pq = _arrow()
     name = path_text(path)
     try:
-        table = pq.read_table(path)
+        content = path.read_bytes()
+        table = pq.read_table(pa.BufferReader(content))
         about = About(**json.loads((table.schema.metadata or {})[ABOUT]))
     except OSError as error:
-        raise ValueError(f"cannot read {name}: {error}") from error
+        raise ValueError(f"cannot read {name}: {error.strerror or error}") from error
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{name} is no data set of `tlf export`") from error
-    columns = {one: table[one].to_numpy() for one in table.column_names if one not in PLACE[1:3]}
     names = [f"observation_{one}" for one in about.entries]
-    missing = {*names, *OUTCOME, "action_0", "action_1"} - set(columns)
+    missing = {*PLACE, *names, *OUTCOME, "action_0", "action_1"} - set(table.column_names)
     if missing:
         raise ValueError(f"{name} has no column {sorted(missing)[0]}")
-    kept = ~np.isnan(columns["action_0"])
-    return Rows(
-        observations=np.stack([columns[one][kept] for one in names], axis=1).astype(np.float32),
-        actions=np.stack([columns[f"action_{i}"][kept] for i in (0, 1)], axis=1).astype(np.float32),
-        rewards=columns["reward"][kept],
-        last=(columns["terminated"] | columns["truncated"])[kept],
+    texts = {one: tuple(sorted(set(table[one].unique().to_pylist()))) for one in PLACE[1:4]}
+    columns = {one: table[one].to_numpy() for one in table.column_names if one not in PLACE[1:3]}
+    acted = ~np.isnan(columns["action_0"])
+    steps = np.flatnonzero(acted)
+    if len(steps) == 0:
+        raise ValueError(f"{name} has no step")
+    last = columns["terminated"] | columns["truncated"]
+    _check_order(name, columns, acted, last)
+    seen = np.stack([columns[one] for one in names], axis=1).astype(np.float32)
+    rows = Rows(
+        observations=seen[steps],
+        actions=np.stack([columns[f"action_{i}"][steps] for i in (0, 1)], axis=1).astype(
+            np.float32
+        ),
+        rewards=columns["reward"][steps],
+        next_observations=seen[steps + 1],
+        terminated=columns["terminated"][steps],
+        last=last[steps],
+        tasks=texts["task"],
+        disturbances=texts["disturbance"],
+        seeds=texts["seed"],
         about=about,
+        file=path.name,
+        sha256=hashlib.sha256(content).hexdigest(),
     )
+    for what, numbers in rows._asdict().items():
+        if isinstance(numbers, np.ndarray) and not np.isfinite(numbers).all():
+            raise ValueError(f"{name} holds {what} that are not finite")
+    if np.abs(rows.actions).max() > 1.0:
+        raise ValueError(
+            f"{name} holds an action of {np.abs(rows.actions).max():g}; actions must lie within ±1"
+        )
+    return rows
+
+
+def _check_order(name: str, columns: dict[str, np.ndarray], acted: np.ndarray, last: Any) -> None:
+    """Check that after each step comes the next one of its episode, or its last observation.
+
+    Raises
+    ------
+    ValueError
+        naming the first step that lacks it.
+    """
+    same = acted[:-1].copy()
+    for one, apart in ((PLACE[0], 0), (PLACE[4], 0), (PLACE[5], 1)):
+        same &= columns[one][1:] - columns[one][:-1] == apart
+    same &= acted[1:] != last[:-1]  # after the end without an action, else with one
+    wrong = np.flatnonzero(acted & ~np.append(same, False))
+    if len(wrong):
+        k = wrong[0]
+        place = ", ".join(f"{one} {columns[one][k]}" for one in (PLACE[0], PLACE[4], PLACE[5]))
+        what = "last observation" if last[k] else "next step"
+        raise ValueError(f"{name}: {place} has no row with its {what} behind it")
+
+
+def fitting_rows(path: Path, scenario: Scenario) -> Rows:
+    """As :func:`read_rows`, of a data set with the scenario's observation and action.
+
+    Raises
+    ------
+    ValueError
+        as there, and for data of another observation, another kind of action, or actions that mean another
+        twist.
+    """
+    data, name = read_rows(path), path_text(path)
+    mine = (scenario.action, entry_names(scenario))
+    if (data.about.action, data.about.entries) != mine:
+        raise ValueError(
+            f"{name} has {len(data.about.entries)} entries of {data.about.observation!r} observations and "
+            f"{data.about.action!r} actions; the scenario has {len(mine[1])} of {scenario.observation!r} and "
+            f"{scenario.action!r}"
+        )
+    theirs, wanted = interface(_acted_in(data.about, name)), interface(scenario)
+    for field in ACTION_MEANING:
+        if theirs.get(field) != wanted.get(field):
+            raise ValueError(
+                f"{name} has actions with {field} {theirs.get(field)}; the scenario has "
+                f"{wanted.get(field)}"
+            )
+    return data
+
+
+def _acted_in(about: About, name: str) -> Scenario:
+    """A scenario in which actions mean what they do in a data set; runs no code that its file names."""
+    try:
+        fields = dict(yaml.safe_load(about.scenario) or {})
+    except (yaml.YAMLError, TypeError, ValueError) as error:
+        raise ValueError(f"{name} is no data set of `tlf export`") from error
+    kept = {one: fields[one] for one in ACTION_FIELDS if one in fields}
+    code = [one for one, value in kept.items() if isinstance(value, str) and is_part(value)]
+    return load_scenario("infinity", **{one: kept[one] for one in kept if one not in code})
 
 
 def write_minari(

@@ -83,7 +83,8 @@ class LearnedPolicy:
         self._columns: Columns | None = None  # of the observation; found at the first use
         network = self.card.network
         self._past = None if network.history is None else Past(network.history, self.card.entries)
-        self._squashed = network.head == "squashed_gaussian"
+        self._squashed = network.head != "gaussian"
+        self._without_draws = network.head == "tanh"
         self._activation = ACTIVATIONS[network.activation]
         self._normalisation = (
             tuple(tensors[f"normalise.{name}"] for name in ("mean", "var", "epsilon", "clip"))
@@ -101,9 +102,9 @@ class LearnedPolicy:
         )
         self._hidden = [_dense_pair(tensors, f"hidden.{i}") for i in range(len(network.hidden))]
         self._mean = _dense_pair(tensors, "mean")
-        if self._squashed:
+        if network.head == "squashed_gaussian":
             self._log_std_layer = _dense_pair(tensors, "log_std")
-        else:
+        elif network.head == "gaussian":
             self._log_std = tensors["log_std"]
         self._generator = np.random.default_rng(seed)
         card = self.card
@@ -166,8 +167,8 @@ class LearnedPolicy:
         episode_start
             With a state: True for the rows ``(row,)`` whose state is reset first. None: no row.
         deterministic
-            False draws from the policy's Gaussian. The draws come from one generator, seeded when the
-            policy was loaded, so the same calls after a new load give the same draws.
+            False draws from the policy's Gaussian, if it has one. The draws come from one generator, seeded
+            when the policy was loaded, so the same calls after a new load give the same draws.
 
         Returns
         -------
@@ -200,7 +201,8 @@ class LearnedPolicy:
             rows = next_state[0][0]
         for layer in self._hidden:
             rows = _through(rows, *layer, self._activation)
-        action = self._chosen(rows) if deterministic else self._drawn(rows)
+        chosen = deterministic or self._without_draws
+        action = self._chosen(rows) if chosen else self._drawn(rows)
         return (action[0] if observation.ndim == 1 else action), next_state
 
     def _normalised(self, rows: np.ndarray) -> np.ndarray:

@@ -13,6 +13,9 @@ from tlf_env.task.actions import ACTION_SIZE
 NORMALISATION = "normalise."
 LSTM_GATES = 4  # input, forget, cell, output, in this order
 
+# squashed: tanh of the draw, as SAC does; tanh: of the mean, and nothing is drawn, as in TD3
+Head = Literal["gaussian", "squashed_gaussian", "tanh"]
+
 Size = Annotated[Whole, Field(ge=1)]
 
 
@@ -26,7 +29,7 @@ class Network(Frozen):
     activation: Literal["tanh", "relu"]  # after each of them
     history: History | None = None  # None: it sees the present observation only
     lstm: Size | None = None  # size of its state; None without an LSTM
-    head: Literal["gaussian", "squashed_gaussian"]  # squashed: tanh of the draw, as SAC does
+    head: Head
     normalised: Switch = False  # whether observations are normalised as VecNormalize does
 
     @model_validator(mode="after")
@@ -56,6 +59,8 @@ class Network(Frozen):
             shapes |= {f"hidden.{i}.weight": (width, size), f"hidden.{i}.bias": (width,)}
             size = width
         shapes |= {"mean.weight": (ACTION_SIZE, size), "mean.bias": (ACTION_SIZE,)}
+        if self.head == "tanh":
+            return shapes
         if self.head == "gaussian":
             return shapes | {"log_std": (ACTION_SIZE,)}
         return shapes | {"log_std.weight": (ACTION_SIZE, size), "log_std.bias": (ACTION_SIZE,)}

@@ -37,11 +37,15 @@ def check_training(scenario: Scenario) -> None:
     ValueError
         naming the task or the disturbance that may not.
     """
-    check_choosing(scenario)
-    if scenario.disturbance.name in CHOOSING_DISTURBANCES:
+    check_training_names(scenario.name, scenario.disturbance.name)
+
+
+def check_training_names(task: str, disturbance: str) -> None:
+    """As :func:`check_training`, by the names of the task and the disturbance."""
+    check_choosing_names(task, disturbance)
+    if disturbance in CHOOSING_DISTURBANCES:
         raise ValueError(
-            f"disturbance {scenario.disturbance.name!r} chooses between trained policies; it must not "
-            "train or tune"
+            f"disturbance {disturbance!r} chooses between trained policies; it must not train or tune"
         )
 
 
@@ -53,9 +57,14 @@ def check_choosing(scenario: Scenario) -> None:
     ValueError
         naming the task or the disturbance that is for tests only.
     """
+    check_choosing_names(scenario.name, scenario.disturbance.name)
+
+
+def check_choosing_names(task: str, disturbance: str) -> None:
+    """As :func:`check_choosing`, by the names of the task and the disturbance."""
     for what, name, reserved in (
-        ("task", scenario.name, TEST_TASKS),
-        ("disturbance", scenario.disturbance.name, TEST_DISTURBANCES),
+        ("task", task, TEST_TASKS),
+        ("disturbance", disturbance, TEST_DISTURBANCES),
     ):
         if name in reserved or name.startswith(TEST_SET):
             raise ValueError(

@@ -16,6 +16,7 @@ from safetensors.torch import save
 
 from baselines.sb3 import FormationVecEnv
 from baselines.training.history import HistoryVecEnv
+from baselines.training.offline import DataBuffer
 from tlf_env.common.files import atomic
 
 TENSOR = "tensor:"  # marks a tensor's name in the tree of plain values
@@ -28,7 +29,7 @@ def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, notes: dict[
     Parameters
     ----------
     model
-        PPO, SAC or RecurrentPPO between two calls of ``learn``.
+        PPO, SAC, RecurrentPPO or TD3BC between two calls of ``learn``.
     notes
         Any JSON values; :func:`read_checkpoint` returns them.
     """
@@ -93,17 +94,17 @@ def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, 
 
 def _memory(model: Any) -> dict[str, Any]:
     """State of a model between two calls of ``learn``, in addition to its parameters."""
-    kept: dict[str, Any] = {
-        "last_observations": torch.from_numpy(model._last_obs),
-        "starts": torch.from_numpy(np.asarray(model._last_episode_starts)),
-    }
+    kept: dict[str, Any] = {}
+    if model._last_obs is not None:  # offline no episode runs
+        kept["last_observations"] = torch.from_numpy(model._last_obs)
+        kept["starts"] = torch.from_numpy(np.asarray(model._last_episode_starts))
     for name in model._get_torch_save_params()[1]:  # SAC's temperature is not among the parameters
         kept[name] = getattr(model, name)
     states = getattr(model, "_last_lstm_states", None)
     if states is not None:
         kept["lstm"] = [list(states.pi), list(states.vf)]
     buffer = getattr(model, "replay_buffer", None)
-    if buffer is not None:
+    if buffer is not None and not isinstance(buffer, DataBuffer):
         rows = buffer.buffer_size if buffer.full else buffer.pos
         kept |= {"place": buffer.pos, "full": bool(buffer.full)}
         kept |= {name: torch.from_numpy(getattr(buffer, name)[:rows]) for name in BUFFERED}
@@ -111,8 +112,9 @@ def _memory(model: Any) -> dict[str, Any]:
 
 
 def _remember(model: Any, kept: dict[str, Any]) -> None:
-    model._last_obs = kept["last_observations"].numpy()
-    model._last_episode_starts = kept["starts"].numpy()
+    if "last_observations" in kept:
+        model._last_obs = kept["last_observations"].numpy()
+        model._last_episode_starts = kept["starts"].numpy()
     for name in model._get_torch_save_params()[1]:
         getattr(model, name).data.copy_(kept[name])  # in place: the optimizer refers to it
     if "lstm" in kept:

@@ -72,6 +72,21 @@ class ImitationConfig(Frozen):
     learning_rate: Positive = 1e-3
 
 
+class OfflineConfig(Frozen):
+    """Learning from data sets alone; TD3BC, and no other algorithm, has it."""
+
+    # Parquet files of `tlf export`, with the observation and the action of the scenario.
+    data: Annotated[str, Field(min_length=1)] | Annotated[tuple[str, ...], Field(min_length=1)]
+    # What the value of an action counts against its distance from the data's; 0: imitation of the data.
+    alpha: NonNegative = 2.5
+    normalise: Switch = True  # observations, by mean and spread of the data
+
+    @property
+    def files(self) -> tuple[str, ...]:
+        """The files of the data."""
+        return (self.data,) if isinstance(self.data, str) else self.data
+
+
 class CurriculumConfig(Frozen):
     """The levels one after another: an episode draws one of those that were reached so far."""
 
@@ -158,21 +173,22 @@ class SearchConfig(Frozen):
 class TrainConfig(Frozen):
     """A training: the algorithm, the episodes and the evaluation. Times in s."""
 
-    algorithm: Literal["PPO", "SAC", "RecurrentPPO"]
+    algorithm: Literal["PPO", "SAC", "RecurrentPPO", "TD3BC"]
     settings: dict[str, Any] = {}  # keyword arguments of SB3's algorithm
     final_learning_rate_share: Annotated[Number, Field(gt=0, le=1)] = 1.0  # falls linearly
     network: NetworkConfig = NetworkConfig()
     imitation: ImitationConfig | None = None
-    robot_steps: Count  # control steps × robots, over all formations
+    offline: OfflineConfig | None = None  # TD3BC: no episode is run but in evaluations
+    # Control steps × robots, over all formations; offline those drawn from the data, updates × batch_size.
+    robot_steps: Count
     formations: Count = 96
     seeds: SeedsFromTo = TRAINING_SEEDS  # of the episodes
     scenario: dict[str, Any] = {}  # scenario fields of every task
     tasks: Annotated[
         dict[str, dict[str, Any]], Field(min_length=1)
     ]  # task: its own scenario fields; with `base`, the task is a new one, built on that
-    disturbances: Annotated[
-        dict[str, NonNegative], Field(min_length=1)
-    ]  # preset or file: share of episodes; also PRESET@LEVEL, as ice@1.3
+    # Preset or file: share of episodes; also PRESET@LEVEL, as ice@1.3.
+    disturbances: Annotated[dict[str, NonNegative], Field(min_length=1)] = {"nominal": 1.0}
     levels: Annotated[tuple[Positive, ...], Field(min_length=1)] = (1.0,)  # with equal shares
     curriculum: CurriculumConfig | None = None  # None: all levels from the start
     checkpoint_every: Count = 1_000_000  # robot steps
@@ -187,6 +203,13 @@ class TrainConfig(Frozen):
                 f"RecurrentPPO, and no other algorithm, needs network.lstm; got {self.network.lstm} "
                 f"with {self.algorithm}"
             )
+        if (self.offline is not None) != (self.algorithm == "TD3BC"):
+            raise ValueError(
+                "TD3BC, and no other algorithm, needs offline; got "
+                f"{'none' if self.offline is None else 'one'} with {self.algorithm}"
+            )
+        if self.offline is not None and self.network.history is not None:
+            raise ValueError("offline needs a network without history: its data have none")
         if self.network.history is not None and self.network.lstm is not None:
             raise ValueError("network.history and network.lstm exclude each other; both are given")
         sensors = self.network.input == "sensor"
@@ -376,12 +399,18 @@ def level_of(disturbance: str) -> tuple[str, float | None]:
         return disturbance, None
 
 
+def _file_beside(folder: Path, name: Any) -> Any:
+    """The path of a file in the folder, if there is such a file; of each one of a list."""
+    if isinstance(name, list):
+        return [_file_beside(folder, one) for one in name]
+    return str(folder / name) if isinstance(name, str) and (folder / name).is_file() else name
+
+
 def _place_files(data: dict[str, Any], folder: Path) -> None:
     """Replace the files in the configuration's folder by their paths: disturbances, bases, data."""
-    imitation = data.get("imitation")
-    if isinstance(imitation, dict) and isinstance(imitation.get("data"), str):
-        beside_it = folder / imitation["data"]
-        imitation["data"] = str(beside_it) if beside_it.is_file() else imitation["data"]
+    for section in map(data.get, ("imitation", "offline")):
+        if isinstance(section, dict) and "data" in section:
+            section["data"] = _file_beside(folder, section["data"])
     tasks = data.get("tasks")
     for own in tasks.values() if isinstance(tasks, dict) else ():
         if isinstance(own, dict) and BASE in own:

@@ -11,7 +11,7 @@ import numpy as np
 
 from baselines.policies.card import WEIGHTS, Card, write_policy
 from baselines.policies.learned import LearnedPolicy, load_policy
-from baselines.policies.network import Network
+from baselines.policies.network import Head, Network
 from baselines.runs.provenance import installed_versions, versions
 from baselines.training.history import ModelPolicy, history_of
 from baselines.training.sensor_policy import SensorPolicy
@@ -23,7 +23,12 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 TRAINERS = ("torch", "stable-baselines3", "sb3-contrib")
-ALGORITHMS = ("PPO", "SAC", "RecurrentPPO")
+ALGORITHMS = ("PPO", "SAC", "RecurrentPPO", "TD3", "TD3BC")
+HEADS: dict[str, Head] = {
+    "SAC": "squashed_gaussian",
+    "TD3": "tanh",
+    "TD3BC": "tanh",
+}  # of the others: gaussian
 AGREEMENT = 1e-5  # largest difference between an action of the model and of its copy
 CHECKED_ROWS, CHECKED_STEPS = 32, 4
 
@@ -46,10 +51,10 @@ def export_policy(
     Parameters
     ----------
     model
-        SB3's PPO or SAC or sb3-contrib's RecurrentPPO with an ``MlpPolicy`` (``MlpLstmPolicy``, one
-        layer): tanh or ReLU, no gSDE, actions in [−1, 1]². The statistics of a ``VecNormalize`` that
-        normalises observations are exported, too, and the history of a
-        :class:`~baselines.training.history.HistoryVecEnv`.
+        SB3's PPO, SAC or TD3, :class:`~baselines.training.offline.TD3BC`, or sb3-contrib's
+        RecurrentPPO with an ``MlpPolicy`` (``MlpLstmPolicy``, one layer): tanh or ReLU, no gSDE, actions
+        in [−1, 1]². The statistics of a ``VecNormalize`` that normalises observations are exported, too,
+        and the history of a :class:`~baselines.training.history.HistoryVecEnv`.
     path
         Ends in ``.safetensors``.
     scenario
@@ -101,6 +106,9 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
         actor = model.policy.actor
         hidden, mean = actor.latent_pi, actor.mu
         tensors = _dense("log_std", actor.log_std)
+    elif HEADS.get(type(model).__name__) == "tanh":
+        *hidden, mean, _ = model.policy.actor.mu
+        tensors = {}
     else:
         hidden, mean = model.policy.mlp_extractor.policy_net, model.policy.action_net
         tensors = {"log_std": _array(model.policy.log_std)}
@@ -146,7 +154,7 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
         activation="relu" if "ReLU" in activations else "tanh",
         history=history,
         lstm=None if lstm is None else lstm.hidden_size,
-        head="squashed_gaussian" if type(model).__name__ == "SAC" else "gaussian",
+        head=HEADS.get(type(model).__name__, "gaussian"),
         normalised=normalised,
     )
     return network, tensors

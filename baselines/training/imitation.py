@@ -8,8 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from baselines.data.episodes import entry_names
-from baselines.data.files import read_rows
+from baselines.data.files import fitting_rows
 from baselines.policies.reference import ReferencePolicy
 from baselines.policies.registry import check_interface
 from baselines.sb3 import FormationVecEnv
@@ -79,14 +78,7 @@ def free_teacher(name: str, scenario: Scenario) -> ReferencePolicy:
 
 def _from_data(path: Path, scenario: Scenario, gamma: float) -> Rows:
     """The rows of a data set, which must have the scenario's observation and action."""
-    data = read_rows(path)
-    mine = (scenario.action, entry_names(scenario))
-    if (data.about.action, data.about.entries) != mine:
-        raise ValueError(
-            f"{path} has {len(data.about.entries)} entries of {data.about.observation!r} observations and "
-            f"{data.about.action!r} actions; the scenario has {len(mine[1])} of {scenario.observation!r} and "
-            f"{scenario.action!r}"
-        )
+    data = fitting_rows(path, scenario)
     returns = np.empty(len(data.rewards), dtype=np.float32)
     following = 0.0
     for k in reversed(range(len(returns))):

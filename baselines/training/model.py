@@ -9,10 +9,12 @@ from typing import Any
 import numpy as np
 import torch
 from stable_baselines3 import PPO, SAC
+from stable_baselines3.common.vec_env import VecEnv
 
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import TrainConfig
 from baselines.training.history import HistoryVecEnv
+from baselines.training.offline import TD3BC, UPDATES_PER_CALL, read_data, standardised
 from baselines.training.sensor_policy import SensorPolicy, SensorVecEnv
 from tlf_env.common.errors import install_command
 from tlf_env.task.warn import without_warnings
@@ -23,7 +25,8 @@ OFF_POLICY_STEPS = 64
 def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
     """All formations; every episode draws its disturbance from the config's. Gives no warning.
 
-    With a history in the network, their observations contain it.
+    With a history in the network, their observations contain it. Offline there is one formation of each task,
+    which is never stepped.
 
     Raises
     ------
@@ -32,30 +35,29 @@ def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
     """
     tasks, shares = config.mixture()
     history = config.network.history
+    formations = config.formations if config.offline is None else len(tasks)
     given: dict[str, Any] = {"mixture": shares, "threads": threads, "infos": False}
     with without_warnings():
         if history is None:
-            envs = FormationVecEnv(tasks, config.formations, **given)
+            envs = FormationVecEnv(tasks, formations, **given)
         else:
             kind = SensorVecEnv if config.network.input == "sensor" else HistoryVecEnv
-            envs = kind(tasks, config.formations, history=history, **given)
+            envs = kind(tasks, formations, history=history, **given)
     first, end = config.seeds
-    if end - first < config.formations:
-        raise ValueError(
-            f"formations {config.formations} need as many seeds; there are {end - first}"
-        )
+    if end - first < formations:
+        raise ValueError(f"formations {formations} need as many seeds; there are {end - first}")
     return envs
 
 
 def make_model(config: TrainConfig, envs: FormationVecEnv, seed: int) -> Any:
-    """A new model of SB3.
+    """A new model of SB3; offline with its data.
 
     Raises
     ------
     ValueError
-        for settings that the algorithm does not have, or values that it refuses.
+        for settings that the algorithm does not have, values that it refuses, or data that do not fit.
     """
-    network = config.network
+    network, offline = config.network, config.offline
     layers = list(network.hidden)
     policy: dict[str, Any] = {
         "net_arch": layers,
@@ -68,22 +70,33 @@ def make_model(config: TrainConfig, envs: FormationVecEnv, seed: int) -> Any:
         kind, policy["layer"] = SensorPolicy, envs.layer
     if network.lstm is not None:
         policy |= {"lstm_hidden_size": network.lstm}
-    if config.algorithm == "SAC":
-        del policy["log_std_init"]  # SAC computes it by a head
-    known = set(inspect.signature(make).parameters) - {"policy", "env", "seed"}
+    if config.algorithm in ("SAC", "TD3BC"):
+        del policy["log_std_init"]  # SAC computes it by a head, TD3BC draws nothing
+    known = set(inspect.signature(make).parameters) - {"policy", "env", "seed", "data", "alpha"}
     for name in config.settings:
         if name not in known:
             raise ValueError(f"settings.{name} is not one of {', '.join(sorted(known))}")
+    given: dict[str, Any] = dict(config.settings)
+    seen: VecEnv = envs
+    if offline is not None:
+        data = read_data(offline.files, envs.plants[0].scenario)
+        given |= {"data": data, "alpha": offline.alpha}
+        seen = standardised(envs, data) if offline.normalise else envs
     try:
-        model = make(kind, envs, policy_kwargs=policy, seed=seed, device="cpu", **config.settings)
+        model = make(kind, seen, policy_kwargs=policy, seed=seed, device="cpu", **given)
     except (TypeError, AssertionError) as error:
         raise ValueError(f"settings: {config.algorithm} refuses them: {error}") from error
-    head = model.actor.mu if config.algorithm == "SAC" else model.policy.action_net
+    if config.algorithm == "TD3BC":
+        head = model.actor.mu[-2]  # before the tanh
+    else:
+        head = model.actor.mu if config.algorithm == "SAC" else model.policy.action_net
     with torch.no_grad():
         head.weight.mul_(network.action_gain)
         head.bias.mul_(network.action_gain)
     if isinstance(model.policy, SensorPolicy):
         model.policy.begin_at_reference()
+    if config.algorithm == "TD3BC":
+        model.actor_target.load_state_dict(model.actor.state_dict())
     return model
 
 
@@ -96,7 +109,7 @@ def algorithm(config: TrainConfig) -> tuple[Callable[..., Any], str]:
         if its package is missing.
     """
     if config.algorithm != "RecurrentPPO":
-        return {"PPO": PPO, "SAC": SAC}[config.algorithm], "MlpPolicy"
+        return {"PPO": PPO, "SAC": SAC, "TD3BC": TD3BC}[config.algorithm], "MlpPolicy"
     try:
         from sb3_contrib import RecurrentPPO
     except ModuleNotFoundError as error:
@@ -129,7 +142,9 @@ def spread_out(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
 
 
 def rollout_steps(model: Any) -> int:
-    """Robot steps of one call of ``learn``: PPO's rollout; SAC updates many times during the call."""
+    """Robot steps of one call of ``learn``: PPO's rollout; the others update many times during the call."""
+    if isinstance(model, TD3BC):
+        return UPDATES_PER_CALL * int(model.batch_size)
     steps = OFF_POLICY_STEPS if hasattr(model, "replay_buffer") else model.n_steps
     return int(steps) * int(model.n_envs)
 

@@ -37,6 +37,7 @@ from baselines.training.model import (
     set_learning_rate,
     spread_out,
 )
+from baselines.training.offline import digest
 from baselines.training.scoring import overall_mm, score_policy
 from baselines.training.sensor_imitation import imitate_with_sensors
 from tlf_env.task.neutral import scenario_hash
@@ -120,7 +121,8 @@ def _train(
     else:
         done = TrainingProgress()
         set_level(envs, config, done)
-        spread_out(model, envs, config.seeds[0])
+        if config.offline is None:
+            spread_out(model, envs, config.seeds[0])
         if config.imitation is not None:
             (imitate_with_sensors if config.network.input == "sensor" else imitate)(
                 model, envs, config
@@ -220,15 +222,23 @@ def evaluate_and_keep(
             training={
                 "robot_steps": model.num_timesteps,
                 "config": config.recorded,
+                **({"data": model.origins} if config.offline else {}),
             },
             seeds={
                 "learner": [seed],
-                "episodes": config.seeds,
+                "episodes": seeds_of_episodes(model, config),
                 "choosing": config.evaluation.seeds,
             },
             scores={"start": done.evaluations[0], "kept": done.evaluations[-1]},
             command=command,
         )
+
+
+def seeds_of_episodes(model: Any, config: TrainConfig) -> tuple[int, ...]:
+    """The first seed and the end of those that the model learned from; offline for each file of data."""
+    if config.offline is None:
+        return config.seeds
+    return tuple(seed for one in model.origins for seed in one["seeds"])
 
 
 def check_folder(config: TrainConfig, seed: int, folder: Path) -> None:
@@ -246,6 +256,8 @@ def check_folder(config: TrainConfig, seed: int, folder: Path) -> None:
         "simulation": simulation_digest(),
         "torch": torch.__version__,
     }
+    if config.offline is not None:
+        plan["data"] = [digest(file) for file in config.offline.files]
     claim(folder / TRAINING_FILE, plan, list(plan), "a training")
 
 

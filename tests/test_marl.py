@@ -1,0 +1,72 @@
+"""The comparison of central and own critics: its table, its figure, and what the page says of it."""
+
+from __future__ import annotations
+
+import importlib
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+SECTION = "## A critic with the truth"
+
+
+@pytest.fixture
+def make_marl(monkeypatch):
+    monkeypatch.syspath_prepend(str(DOCS / "figures"))
+    return importlib.import_module("make_marl")
+
+
+@pytest.fixture
+def kept():
+    return json.loads((DOCS / "learning" / "marl.json").read_text(encoding="utf-8"))
+
+
+def section() -> str:
+    page = (DOCS / "learning.md").read_text(encoding="utf-8")
+    return page.split(SECTION)[1].split("\n## ")[0]
+
+
+def test_the_page_has_the_table_of_the_kept_runs(make_marl, kept):
+    assert make_marl.table(kept) in section()
+
+
+def test_an_interval_is_that_of_student_s_t(make_marl):
+    """Logarithms −1, 0, 1: by the table of the distribution ± 4.303 · 1/√3."""
+    half = 4.303 / np.sqrt(3)
+    assert make_marl.interval([0.1, 1.0, 10.0]) == f"1 [{10**-half:.3g}, {10**half:.3g}]"
+
+
+def test_a_ratio_of_equal_groups_is_one_and_of_distant_ones_not(make_marl):
+    values = [1.0, 2.0, 4.0]
+    middle, low, high = map(
+        float, make_marl.ratio(values, values).strip("]").replace("[", "").replace(",", "").split()
+    )
+    assert low < middle == 1.0 < high
+    far = make_marl.ratio([100 * value for value in values], values)
+    assert far.startswith("100 [")
+    assert float(far.split("[")[1].split(",")[0]) > 1
+
+
+def test_every_row_counts_the_runs_of_its_seeds(make_marl):
+    runs = [
+        {
+            "variant": "IPPO",
+            "seed": seed,
+            "minutes": 2.0 + seed,
+            "returns": [1.0, 2.0],
+            "nominal": {"rms_mm": [10.0] * 50, "failed": [0] * 50},
+            "slip": {"rms_mm": [100.0] * 50, "failed": [1] * 10 + [0] * 40},
+        }
+        for seed in range(3)
+    ]
+    row = make_marl.table(runs).splitlines()[-1]
+    assert row == "| IPPO | 3 | 10 [10, 10] | 100 [100, 100] |  | 0 of 150 | 30 of 150 | 3.0 |"
+
+
+def test_the_figure_is_drawn(make_marl, kept, tmp_path):
+    path = tmp_path / "marl.png"
+    make_marl.draw(kept, path)
+    assert path.read_bytes().startswith(b"\x89PNG")
