@@ -29,16 +29,20 @@ RUNS = DOCS.parent / "results" / "marl"
 FORMATIONS, STEPS, ROLLOUTS = 64, 128, 40  # of a rollout: formations and control steps
 ROBOTS, JUDGED, HORIZON_S, SETTLED_S = 3, 50, 60.0, 24.0
 SEEDS = 5
-# Algorithm, and whether the robots share one network.
+CELLS = ("nominal", "slip")
+# Algorithm, whether the robots share one network, and whether a central critic sees `state()`; if not, it
+# sees the observations of all robots.
 VARIANTS = {
-    "IPPO": ("Ippo", True),
-    "MAPPO": ("Mappo", True),
-    "IPPO, a network for each robot": ("Ippo", False),
-    "MAPPO, a network for each robot": ("Mappo", False),
+    "IPPO": ("Ippo", True, True),
+    "MAPPO": ("Mappo", True, True),
+    "MAPPO, all observations": ("Mappo", True, False),
+    "IPPO, a network for each robot": ("Ippo", False, True),
+    "MAPPO, a network for each robot": ("Mappo", False, True),
 }
 STYLES = {
     "IPPO": ("#0072B2", "-"),
     "MAPPO": ("#D55E00", "--"),
+    "MAPPO, all observations": ("#CC79A7", (0, (5, 1, 1, 1, 1, 1))),
     "IPPO, a network for each robot": ("#009E73", "-."),
     "MAPPO, a network for each robot": ("#000000", ":"),
 }
@@ -54,8 +58,10 @@ def experiment(variant: str, seed: int) -> Any:
     from baselines.benchmarl import FormationTask
 
     torch.set_num_threads(1)
-    name, shared = VARIANTS[variant]
+    name, shared, true_state = VARIANTS[variant]
     task = FormationTask.INFINITY.get_from_yaml()
+    if not true_state:
+        task.state_spec = lambda env: None
     task.config.update(horizon_s=66.0, infos=())
     config = ExperimentConfig.get_from_yaml()
     config.loggers, config.render, config.evaluation = [], False, False
@@ -102,7 +108,7 @@ def trained(variant: str, seed: int) -> dict[str, Any]:
         "returns": returns,
         "minutes": minutes,
         "digest": simulation_digest(),
-        **{name: judged(made.policy, name) for name in ("nominal", "slip")},
+        **{name: judged(made.policy, name) for name in CELLS},
     }
 
 
@@ -161,43 +167,62 @@ def line(one: dict[str, Any]) -> str:
     """A training in one line."""
     cells = [
         f"{name} {np.median(one[name]['rms_mm']):.2f} mm, {sum(one[name]['failed'])} failed"
-        for name in ("nominal", "slip")
+        for name in CELLS
     ]
     return f"{one['variant']}, seed {one['seed']}: {'; '.join(cells)}; {one['minutes']:.1f} minutes"
 
 
+def shown(mean: float, half: float) -> str:
+    """A geometric mean and its interval, from their logarithms to base 10."""
+    middle, low, high = (10.0**value for value in (mean, mean - half, mean + half))
+    return f"{middle:.3g} [{low:.3g}, {high:.3g}]"
+
+
 def interval(values: list[float]) -> str:
-    """Mean of the seeds' values with the 95 % interval of Student's t."""
+    """Geometric mean of the seeds' values with the 95 % interval of Student's t for their logarithms."""
     from scipy.stats import t
 
-    mean, half = np.mean(values), 0.0
+    logs, half = np.log10(values), 0.0
     if len(values) > 1:
-        half = t.ppf(0.975, len(values) - 1) * np.std(values, ddof=1) / np.sqrt(len(values))
-    return f"{mean:.2f} ± {half:.2f}"
+        half = t.ppf(0.975, len(values) - 1) * np.std(logs, ddof=1) / np.sqrt(len(values))
+    return shown(float(np.mean(logs)), float(half))
+
+
+def ratio(values: list[float], others: list[float]) -> str:
+    """Ratio of two geometric means with the 95 % interval of Welch's t for the logarithms."""
+    from scipy.stats import ttest_ind
+
+    if len(values) < 2:
+        return ""
+    mine, theirs = np.log10(values), np.log10(others)
+    low, high = ttest_ind(mine, theirs, equal_var=False).confidence_interval(0.95)
+    return shown(float((low + high) / 2), float((high - low) / 2))
 
 
 def table(found: list[dict[str, Any]]) -> str:
-    """A row for each variant: geometric mean of the medians, and failed runs."""
+    """A row for each variant: geometric mean of the seeds' medians, ratio to the first, and failed runs."""
     lines = [
-        "| variant | seeds | log₁₀ of the RMS error in mm, nominal | under `slip` | failed, nominal | "
-        "under `slip` | minutes |",
-        "|---|---:|---:|---:|---:|---:|---:|",
+        "| variant | seeds | RMS error, nominal, mm | under `slip`, mm | ratio to IPPO, nominal | "
+        "failed, nominal | under `slip` | minutes |",
+        "|---|---:|---:|---:|---:|---:|---:|---:|",
     ]
-    for variant in VARIANTS:
-        runs = [one for one in found if one["variant"] == variant]
+    of = {name: [one for one in found if one["variant"] == name] for name in VARIANTS}
+    medians = {
+        name: {cell: [float(np.median(one[cell]["rms_mm"])) for one in runs] for cell in CELLS}
+        for name, runs in of.items()
+    }
+    first = next(iter(VARIANTS))
+    for name, runs in of.items():
         if not runs:
             continue
-        logs = {
-            name: [float(np.log10(np.median(one[name]["rms_mm"]))) for one in runs]
-            for name in ("nominal", "slip")
-        }
-        failed = {name: sum(sum(one[name]["failed"]) for one in runs) for name in logs}
-        total = JUDGED * len(runs)
-        lines.append(
-            f"| {variant} | {len(runs)} | {interval(logs['nominal'])} | {interval(logs['slip'])} | "
-            f"{failed['nominal']} of {total} | {failed['slip']} of {total} | "
-            f"{np.median([one['minutes'] for one in runs]):.1f} |"
-        )
+        mine = medians[name]
+        failed = [
+            f"{sum(sum(one[cell]['failed']) for one in runs)} of {JUDGED * len(runs)}"
+            for cell in CELLS
+        ]
+        against = "" if name == first else ratio(mine[CELLS[0]], medians[first][CELLS[0]])
+        cells = [name, str(len(runs)), *(interval(mine[cell]) for cell in CELLS), against, *failed]
+        lines.append(f"| {' | '.join(cells)} | {np.median([one['minutes'] for one in runs]):.1f} |")
     return "\n".join(lines)
 
 
