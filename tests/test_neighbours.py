@@ -27,9 +27,9 @@ SHORT = {
 GAP, HORIZON, ROBOTS, FORMATIONS = 5, 12, 3, 4
 
 
-def made(name, **more):
-    arm = arms.Arm(name, **more)
-    envs = arms.environments(arm, "infinity", FORMATIONS, robots=ROBOTS, infos=False, **SHORT)
+def made(name):
+    arm = arms.Arm(name)
+    envs = arms.RowVecEnv("infinity", FORMATIONS, arm=arm, robots=ROBOTS, infos=False, **SHORT)
     envs.seed(3)
     return envs, envs.reset()
 
@@ -54,9 +54,8 @@ def ahead(rows):
     return found
 
 
-@pytest.mark.parametrize("by_path", [False, True])
-def test_a_robot_gets_its_predecessors_observation_of_now_and_of_one_gap_ago(by_path):
-    envs, seen = made("shared", by_path=by_path)
+def test_a_robot_gets_its_predecessors_observation_of_now_and_of_one_gap_ago():
+    envs, seen = made("shared")
     size = plain_rows(envs).shape[1]
     assert envs.observation_space.shape == (3 * size,)
     rows = [plain_rows(envs)]
@@ -138,46 +137,46 @@ def test_a_policy_sees_in_a_run_what_its_environments_showed(name):
         seen, _, start, _ = envs.step(actions)
 
 
-def test_rewards_by_the_path_have_the_distance_to_the_leaders_path():
-    envs, _ = made("heard", by_path=True)
-    other, _ = made("heard")
-    weights = envs.plants[0].scenario.reward
-    for step in range(HORIZON):
-        actions = actions_of(envs, step)
-        rewards, plain = envs.step(actions)[1], other.step(actions)[1]
-        if step == HORIZON - 1:  # the last step keeps its reward
-            np.testing.assert_array_equal(rewards, plain)
-            break
-        by_path, own = (
-            other.plants[0].info(f"{name}_error_mm").ravel() for name in ("formation", "position")
-        )
-
-        def worth(e):
-            e = e[:, np.newaxis]
-            parts = {
-                "far": e / 1000,
-                "coarse": np.exp(-e / 100),
-                "medium": np.exp(-e / 10),
-                "fine": np.exp(-e / 2),
-            }
-            return np.concatenate([weights[key] * part for key, part in parts.items()], axis=1).sum(
-                axis=1
-            )
-
-        np.testing.assert_allclose(rewards - plain, worth(by_path) - worth(own), atol=1e-5)
-        leaders = np.arange(envs.num_envs) % ROBOTS == 0
-        np.testing.assert_array_equal(rewards[leaders], plain[leaders])
-        assert (rewards[~leaders] != plain[~leaders]).any()
-
-
 def test_tasks_with_different_gaps_are_refused():
     with pytest.raises(ValueError, match=r"time_gap_s 0\.2, the first task 5;"):
-        arms.environments(
-            arms.ARMS["shared"],
+        arms.RowVecEnv(
             {
                 "a": ["infinity"],
                 "b": {"name": "b", "base": "infinity", "time_gap_s": 0.2},
             },
             2,
+            arm=arms.ARMS["shared"],
             **{key: value for key, value in SHORT.items() if key != "time_gap_s"},
         )
+
+
+@pytest.mark.parametrize("relayed", [False, True])
+def test_a_correction_is_the_predecessors_error_of_one_gap_ago(relayed):
+    scenario = arms.RowVecEnv("infinity", 1, arm=arms.Arm("own"), robots=ROBOTS, **SHORT).plants[0]
+    scenario = scenario.scenario
+    names = arms.entry_names(scenario)
+    seen = []
+
+    def predict(rows, *_):
+        seen.append(rows.copy())
+        return np.zeros((len(rows), 2)), None
+
+    policy = arms.CorrectingPolicy(SimpleNamespace(predict=predict), scenario, relayed)
+    generator = np.random.default_rng(0)
+    rows = generator.normal(size=(3 * GAP, 2 * ROBOTS, len(names))).astype(np.float32)
+    places = [names.index(name) for name in ("e_1", "e_2")]
+    rows[:, :, places] *= 0.005  # a few mm
+    state, start = None, np.ones(2 * ROBOTS, dtype=np.bool_)
+    for one in rows:
+        _, state = policy.predict(one, state, start)
+        start[:] = False
+    sent_mm = (np.array(seen) if relayed else rows)[:, :, places] * 500
+    for step in range(3 * GAP):
+        heard = ahead(sent_mm[step - GAP]) if step >= GAP else np.zeros((2 * ROBOTS, 2))
+        heard = np.clip(heard, -arms.MOST_MM, arms.MOST_MM)
+        wanted = rows[step].copy()
+        for kind, scale in (("", 500), ("_fine", 10)):
+            for i in (1, 2):
+                wanted[:, names.index(f"e_{i}{kind}")] += heard[:, i - 1] / scale
+        np.testing.assert_allclose(seen[step], wanted, rtol=1e-4, atol=1e-4)
+    assert (np.abs(sent_mm) > 0.1).any()

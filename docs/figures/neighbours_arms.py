@@ -1,4 +1,4 @@
-"""What robots of a row see in the arms of ``make_neighbours.py``: environments and policies."""
+"""What robots of a row see or send in the arms of ``make_neighbours.py``: environments and policies."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ import numpy as np
 
 from baselines.data.episodes import entry_names
 from baselines.sb3 import FormationVecEnv
-from tlf_env.engine.batch import BatchPlant
-from tlf_env.task.observation import OBSERVATION_LIMIT
-from tlf_env.task.reward import RewardTerms, reward_terms
+from tlf_env.onboard.parts import Policy
+from tlf_env.task.observation import OBSERVATION_LIMIT, TRACKING_ENTRIES
 from tlf_env.task.scenario import Scenario
 
 TWIST = 2  # entries of an action that move the robot; messages follow
 MESSAGE = 4  # entries of a message
 OF_PREDECESSOR = "predecessor_"
-OF_THE_ERROR = ("far", "coarse", "medium", "fine")  # terms of the reward
+ERROR = ("e_1", "e_2", "e_1_fine", "e_2_fine")
+MOST_MM = 20.0  # of a correction, forward and to the right: a start is not corrected
 
 
 class Arm(NamedTuple):
@@ -25,7 +25,6 @@ class Arm(NamedTuple):
 
     sees: str  # own, heard, shared or sent
     neighbour: bool = False  # hear one more robot
-    by_path: bool = False  # rewarded for the distance to the leader's path
 
 
 ARMS = {
@@ -33,15 +32,18 @@ ARMS = {
     "heard": Arm("heard"),
     "two": Arm("heard", neighbour=True),
     "shared": Arm("shared"),
-    "heard-path": Arm("heard", by_path=True),
-    "shared-path": Arm("shared", by_path=True),
-    "sent-path": Arm("sent", by_path=True),
 }
 
 
 def gap_steps(scenario: Scenario) -> int:
     """Control steps of a time gap."""
     return round(scenario.time_gap_s / scenario.control_period_s)
+
+
+def leaders_of(rows: int, scenario: Scenario) -> np.ndarray:
+    """Which of some rows, those of whole formations in order, are leaders."""
+    result: np.ndarray = np.arange(rows) % scenario.robot_count == 0
+    return result
 
 
 class Earlier:
@@ -73,6 +75,13 @@ class Earlier:
     def clear(self, rows: np.ndarray) -> None:
         """Forget the values of the rows of a mask."""
         self._kept[:, rows] = 0.0
+
+
+def ahead(values: np.ndarray, leaders: np.ndarray) -> np.ndarray:
+    """The row of the predecessor in place of the own one, ``(row, entry)``; 0 for leaders."""
+    shifted = np.roll(values, 1, axis=0)
+    shifted[leaders] = 0.0
+    return shifted
 
 
 class Sight:
@@ -110,14 +119,9 @@ class Sight:
                 last = present
             case _:
                 last = self._earlier.ago(1)
-        parts = [present, self._ahead(last), self._ahead(self._earlier.ago(self._gap))]
+        late = self._earlier.ago(self._gap)
+        parts = [present, ahead(last, self._leaders), ahead(late, self._leaders)]
         return np.concatenate(parts, axis=1)
-
-    def _ahead(self, values: np.ndarray) -> np.ndarray:
-        """The row of the predecessor in place of the own one; 0 for leaders."""
-        shifted = np.roll(values, 1, axis=0)
-        shifted[self._leaders] = 0.0
-        return shifted
 
     def note(self, present: np.ndarray, messages: np.ndarray) -> None:
         """Keep what a step began with, and the messages that were sent in it."""
@@ -132,7 +136,7 @@ class Sight:
 
 
 class RowVecEnv(FormationVecEnv):
-    """Formations whose robots see, and are rewarded, as in an arm.
+    """Formations whose robots see what they see in an arm.
 
     In the arm that sends, an action has :data:`MESSAGE` further entries. They move nothing and cost nothing.
 
@@ -197,35 +201,6 @@ class RowVecEnv(FormationVecEnv):
         return observations, rewards, dones, infos
 
 
-class PathVecEnv(RowVecEnv):
-    """As its base; the terms of the reward that depend on the error have the distance to the leader's path."""
-
-    def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
-        """As its base, but for the rewards. An episode that ended keeps the reward of its last step."""
-        observations, rewards, dones, infos = super().step_wait()
-        found = np.concatenate([by_path(plant).ravel() for plant in self.plants])
-        return observations, np.where(dones, rewards, rewards + found), dones, infos
-
-
-def by_path(plant: BatchPlant) -> np.ndarray:
-    """What the rewards of the last step gain with the distance to the leader's path, ``(formation, robot)``."""
-    places = [RewardTerms._fields.index(name) for name in OF_THE_ERROR]
-    chosen = np.array([plant.scenario.reward[name] for name in OF_THE_ERROR])
-    distances_mm = plant.info("formation_error_mm")
-    wanted = [
-        reward_terms(one, 0.0, 0.0, 0.0, False, False)[: len(OF_THE_ERROR)]
-        for one in distances_mm.ravel().tolist()
-    ]
-    gained = np.array(wanted).reshape(*distances_mm.shape, -1) - plant.terms[:, :, places]
-    result: np.ndarray = gained @ chosen
-    return result
-
-
-def environments(arm: Arm, *args: Any, **kwargs: Any) -> RowVecEnv:
-    """The environments of an arm."""
-    return (PathVecEnv if arm.by_path else RowVecEnv)(*args, arm=arm, **kwargs)
-
-
 class RowPolicy:
     """A model of SB3 that was trained in an arm, as a policy for the observations of whole rows.
 
@@ -244,10 +219,60 @@ class RowPolicy:
     ) -> tuple[np.ndarray, Any]:
         """As SB3's ``predict``, for the rows of all robots of some formations, in order."""
         if state is None:
-            leaders = np.arange(len(observation)) % self._scenario.robot_count == 0
+            leaders = leaders_of(len(observation), self._scenario)
             state = Sight(self._arm.sees, self._scenario, leaders)
         if episode_start is not None and episode_start.any():
             state.clear(episode_start)
         actions, _ = self._model.predict(state.seen(observation), deterministic=deterministic)
         state.note(observation, actions[:, TWIST:])
         return actions[:, :TWIST], state
+
+
+class CorrectingPolicy:
+    """A law on ``tracking`` observations, whose robots send their errors to their successors.
+
+    A follower's reference is where its predecessor was one gap ago, so it repeats its predecessor's error of
+    that time. Here it adds this error to its own, and so follows its predecessor's reference. With relayed
+    messages that error is the corrected one, and all robots follow the leader's reference. The headings of both
+    robots at that place are taken to be the same.
+
+    Parameters
+    ----------
+    policy
+        A law without a state.
+    scenario
+        Of the run.
+    relayed
+        Whether a robot sends its corrected error, or its own.
+    """
+
+    def __init__(self, policy: Policy, scenario: Scenario, relayed: bool) -> None:
+        self._policy, self._scenario, self._relayed = policy, scenario, relayed
+        names = entry_names(scenario)
+        self._places = [names.index(name) for name in ERROR]
+        self._scales_mm = np.array([TRACKING_ENTRIES[name].scale for name in ERROR])
+
+    def predict(
+        self,
+        observation: np.ndarray,
+        state: Any = None,
+        episode_start: np.ndarray | None = None,
+        deterministic: bool = True,
+    ) -> tuple[np.ndarray, Any]:
+        """As SB3's ``predict``, for the rows of all robots of some formations, in order.
+
+        The state is an :class:`Earlier`, which each call changes.
+        """
+        steps = gap_steps(self._scenario)
+        if state is None:
+            state = Earlier(steps, len(observation), 2)
+        if episode_start is not None and episode_start.any():
+            state.clear(episode_start)
+        leaders = leaders_of(len(observation), self._scenario)
+        heard_mm = np.clip(ahead(state.ago(steps), leaders), -MOST_MM, MOST_MM)
+        own_mm = observation[:, self._places[:2]] * self._scales_mm[:2]
+        corrected = observation.copy()
+        corrected[:, self._places] += np.tile(heard_mm, 2) / self._scales_mm
+        actions, _ = self._policy.predict(corrected, None, episode_start, deterministic)
+        state.note(own_mm + heard_mm if self._relayed else own_mm)
+        return actions, state
