@@ -182,16 +182,13 @@ def law_of(name: str, scenario: Scenario) -> tuple[Policy, Scenario]:
 def judge_arm(name: str, trained: Path) -> list[dict[str, Any]]:
     """What every training of an arm does in every cell, and when one robot slips."""
     rows = []
-    if name == BASE:
+    if name in LAWS:
         for cell in CELLS:
-            policy, scenario, _ = fit_policy(BASE_POLICY, scenario_of(cell))
+            policy, scenario = law_of(name, scenario_of(cell))
             found = driven(policy, scenario, cell.most_runs)
             rows.append({"cell": cell.name, "arm": name, "seed": 0, **found})
-        policy, scenario, _ = fit_policy(BASE_POLICY, row_scenario())
-        return [
-            *rows,
-            {"cell": "kick", "arm": name, "seed": 0, "moved_mm": kicked(policy, scenario)},
-        ]
+        moved = kicked(*law_of(name, row_scenario()))
+        return [*rows, {"cell": "kick", "arm": name, "seed": 0, "moved_mm": moved}]
     arm = ARMS[name]
     for folder in sorted((trained / name).glob("seed_*")):
         print(name, folder.name, flush=True)
