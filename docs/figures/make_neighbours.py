@@ -84,7 +84,7 @@ class Cell(NamedTuple):
 
 SHOWN = {"infinity": "∞", "long_circle": "circle"}
 CELLS = [
-    *(Cell("infinity", name, ROW, 65.0, 30) for name in ("slip", "combined-hard", "patches")),
+    *(Cell("infinity", name, ROW, 65.0, 30) for name in ("slip", "patches")),
     Cell("long_circle", "slip", 10, 90.0, 15),
 ]
 SETTLE_S = 20.0  # the last robot repeats for 10 s how the leader catches up after the start
@@ -179,8 +179,8 @@ def law_of(name: str, scenario: Scenario) -> tuple[Policy, Scenario]:
     return policy, needed
 
 
-def judge_arm(name: str, trained: Path) -> list[dict[str, Any]]:
-    """What every training of an arm does in every cell, and when one robot slips."""
+def judge_arm(name: str, seeds: Sequence[int], trained: Path) -> list[dict[str, Any]]:
+    """What the trainings of an arm do in every cell, and when one robot slips."""
     rows = []
     if name in LAWS:
         for cell in CELLS:
@@ -190,10 +190,11 @@ def judge_arm(name: str, trained: Path) -> list[dict[str, Any]]:
         moved = kicked(*law_of(name, row_scenario()))
         return [*rows, {"cell": "kick", "arm": name, "seed": 0, "moved_mm": moved}]
     arm = ARMS[name]
-    for folder in sorted((trained / name).glob("seed_*")):
-        print(name, folder.name, flush=True)
+    for seed in seeds:
+        folder = trained / name / f"seed_{seed}"
+        print(name, seed, flush=True)
         model = PPO.load(folder / MODEL_FILE, device="cpu")
-        about = {"arm": name, "seed": int(folder.name.removeprefix("seed_"))}
+        about = {"arm": name, "seed": seed}
         for cell in CELLS:
             scenario = arm_scenario(cell, arm)
             found = driven(RowPolicy(model, arm, scenario), scenario, cell.most_runs)
@@ -204,6 +205,13 @@ def judge_arm(name: str, trained: Path) -> list[dict[str, Any]]:
         minutes = json.loads((folder / ABOUT_FILE).read_text("utf-8"))["minutes"]
         rows.append({"cell": "training", **about, "minutes": minutes})
     return rows
+
+
+def joined(rows: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
+    """The kept rows with new ones, in place of those of the same arms and training seeds."""
+    again = {(row["arm"], row["seed"]) for row in new}
+    every = [row for row in rows if (row["arm"], row["seed"]) not in again] + new
+    return sorted(every, key=lambda row: ((*LAWS, *ARMS).index(row["arm"]), row["seed"]))
 
 
 # --- measures ------------------------------------------------------------------------------------
@@ -384,14 +392,15 @@ def main() -> None:
     parser.add_argument("--only", choices=(*LAWS, *ARMS), help="judge one arm, and keep the others")
     parser.add_argument("--trained", type=Path, default=TRAINED)
     given = parser.parse_args()
+    seeds = [int(seed) for seed in given.seeds.split(",")]
     rows = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else []
     match given.what:
         case ["train", arm] if arm in ARMS:
-            train_arm(arm, [int(seed) for seed in given.seeds.split(",")], given.trained)
+            train_arm(arm, seeds, given.trained)
             return
         case ["judge"]:
             for name in (given.only,) if given.only else (*LAWS, *ARMS):
-                rows = [row for row in rows if row["arm"] != name] + judge_arm(name, given.trained)
+                rows = joined(rows, judge_arm(name, seeds, given.trained))
                 with atomic(RESULTS, encoding="utf-8") as file:
                     file.write("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
         case []:
