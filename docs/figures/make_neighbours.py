@@ -6,6 +6,8 @@ Writes ``docs/learning/neighbours.json``, the tables of the section *Neighbours 
 
 ``train ARM`` trains an arm of ``neighbours_arms.py`` with some seeds and no evaluation.
 
+``probe`` fits networks that estimate a follower's error half a second later from what it sees in an arm.
+
 ``judge`` runs what was trained on seeds that nothing was tuned on; with ``--only ARM`` one arm alone.
 """
 
@@ -23,23 +25,34 @@ import torch
 from generalisation_kick import SLIPPING, displacements_mm, row_scenario
 from generalisation_runs import along_row
 from make_board import DOCS
-from make_memory import difference
+from make_memory import difference, explained
 from make_parts import put
 from make_speed import table
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
-from neighbours_arms import ARMS, TWIST, Arm, CorrectingPolicy, RowPolicy, RowVecEnv
+from neighbours_arms import (
+    ARMS,
+    TWIST,
+    Arm,
+    CorrectingPolicy,
+    RowPolicy,
+    RowVecEnv,
+    Sight,
+    leaders_of,
+)
 from stable_baselines3 import PPO
 
+from baselines.data.episodes import entry_names
 from baselines.policies.registry import fit_policy
 from baselines.runs.outcome import failed
-from baselines.runs.run import run_seeds
+from baselines.runs.run import PolicyDriver, run_seeds
 from baselines.runs.seed_ranges import FIRST_TABLE_SEED
 from baselines.runs.style import MARKERS, METADATA, hex_colour, tidy
 from baselines.training.config import TrainConfig, load_config
 from baselines.training.model import make_model, rollout_steps, set_learning_rate, spread_out
 from tlf_env.common.files import atomic
+from tlf_env.engine.batch import BatchPlant
 from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -89,6 +102,7 @@ CELLS = [
 ]
 SETTLE_S = 20.0  # the last robot repeats for 10 s how the leader catches up after the start
 KICK_RUNS = 1
+PROBE_SEED = -1  # in place of a training seed
 SIGNIFICANT = 4  # digits that are kept
 
 
@@ -214,6 +228,67 @@ def joined(rows: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[s
     return sorted(every, key=lambda row: ((*LAWS, *ARMS).index(row["arm"]), row["seed"]))
 
 
+def keep(rows: list[dict[str, Any]]) -> None:
+    """Write what was found, a line for each row."""
+    with atomic(RESULTS, encoding="utf-8") as file:
+        file.write("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
+
+
+# --- what can be foreseen ------------------------------------------------------------------------
+
+PROBED = ("slip", "patches")
+PROBE_RUNS = {0: 40, FIRST_TABLE_SEED: 20}  # first seed: runs, to fit and to judge
+PROBE_EVERY, PROBE_LATER = (
+    5,
+    5,
+)  # control steps between two rows, and rows until the error that is wanted
+PROBE_SEES = ("own", "heard", "shared")
+WANTED = ("e_1_fine", "e_2_fine")
+
+
+def foreseen(
+    disturbance: str, first_seed: int, runs: int
+) -> tuple[dict[str, np.ndarray], np.ndarray]:
+    """What followers see in runs of the base, and their errors half a second later, ``(row, entry)``."""
+    cell = next(one for one in CELLS if one.disturbance == disturbance)
+    policy, scenario = law_of(BASE, scenario_of(cell))
+    plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), runs)
+    plant.reset(first_seed)
+    driver = PolicyDriver(policy, scenario, plant.arrays, BASE)
+    rows, names = runs * cell.robots, entry_names(scenario)
+    leaders = leaders_of(rows, scenario)
+    sights = {sees: Sight(sees, scenario, leaders) for sees in PROBE_SEES}
+    wanted = [names.index(name) for name in WANTED]
+    first = round(((cell.robots - 1) * scenario.time_gap_s + SETTLE_S) / scenario.control_period_s)
+    seen: dict[str, list[np.ndarray]] = {sees: [] for sees in sights}
+    errors = []
+    for step in range(scenario.horizon_steps):
+        present = plant.observations.reshape(rows, -1).copy()
+        for sees, sight in sights.items():
+            if step >= first and step % PROBE_EVERY == 0:
+                seen[sees].append(sight.seen(present)[~leaders])
+            sight.note(present, present[:, :0])
+        if step >= first and step % PROBE_EVERY == 0:
+            errors.append(present[~leaders][:, wanted])
+        plant.step(driver.act())
+    kept = {sees: np.concatenate(one[:-PROBE_LATER]) for sees, one in seen.items()}
+    return kept, np.concatenate(errors[PROBE_LATER:]).astype(float)
+
+
+def probe() -> list[dict[str, Any]]:
+    """Share of the variance of a follower's error in half a second that a network finds in what it sees."""
+    torch.set_num_threads(1)
+    rows = []
+    for disturbance in PROBED:
+        fitted, judged = (foreseen(disturbance, *one) for one in PROBE_RUNS.items())
+        for sees in PROBE_SEES:
+            found = explained(fitted[0][sees], fitted[1], judged[0][sees], judged[1])
+            about = {"cell": f"probe, {disturbance}", "arm": sees, "seed": PROBE_SEED}
+            rows.append({**about, "explained": short(found)})
+            print(rows[-1], flush=True)
+    return rows
+
+
 # --- measures ------------------------------------------------------------------------------------
 
 
@@ -325,6 +400,19 @@ def kick_table(rows: list[dict[str, Any]]) -> str:
     return table(["arm", *head, f"robot {last} / robot {SLIPPING + 1}"], out)
 
 
+def probe_table(rows: list[dict[str, Any]]) -> str:
+    """What networks explain of a follower's error half a second later."""
+    out = []
+    for disturbance in PROBED:
+        for place, name in enumerate(("forward", "to the right")):
+            shares = [
+                of(rows, f"probe, {disturbance}", sees)[0]["explained"][place]
+                for sees in PROBE_SEES
+            ]
+            out.append([f"`{disturbance}`", name, *(f"{share:.3f}" for share in shares)])
+    return table(["disturbance", "error", *(f"`{sees}`" for sees in PROBE_SEES)], out, names=2)
+
+
 PAIRS = (("heard", "own"), ("two", "heard"), ("shared", "heard"))
 BY_MESSAGES = ((HOP, BASE), (RELAYED, BASE))
 DRAWN = ("∞, 5 robots, `slip`", "∞, 5 robots, `patches`", "circle, 10 robots, `slip`")
@@ -379,6 +467,7 @@ def tables(rows: list[dict[str, Any]]) -> dict[str, str]:
         "neighbours-path": error_table(rows, path, (*BY_MESSAGES, *PAIRS)),
         "neighbours-growth": growth_table(rows),
         "neighbours-kick": kick_table(rows),
+        "neighbours-probe": probe_table(rows),
     }
 
 
@@ -386,7 +475,7 @@ def main() -> None:
     """Make what is asked for, and write tables and figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "what", nargs="*", help="train ARM; judge; nothing: tables and figure alone"
+        "what", nargs="*", help="train ARM; judge; probe; nothing: tables and figure alone"
     )
     parser.add_argument("--seeds", default="0,1,2", help="of the trainings")
     parser.add_argument("--only", choices=(*LAWS, *ARMS), help="judge one arm, and keep the others")
@@ -401,12 +490,14 @@ def main() -> None:
         case ["judge"]:
             for name in (given.only,) if given.only else (*LAWS, *ARMS):
                 rows = joined(rows, judge_arm(name, seeds, given.trained))
-                with atomic(RESULTS, encoding="utf-8") as file:
-                    file.write("[\n" + ",\n".join(json.dumps(row) for row in rows) + "\n]\n")
+                keep(rows)
+        case ["probe"]:
+            rows = joined(rows, probe())
+            keep(rows)
         case []:
             pass
         case _:
-            parser.error(f"{' '.join(given.what)!r} is none of train ARM, judge")
+            parser.error(f"{' '.join(given.what)!r} is none of train ARM, judge, probe")
     for name, text in tables(rows).items():
         put(PAGE, text, name)
     draw(rows, PICTURE)
