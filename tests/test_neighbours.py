@@ -89,23 +89,6 @@ def test_a_formation_that_is_begun_anew_has_no_past_and_the_others_keep_theirs()
     assert before[begun][1:].any()
 
 
-def test_a_message_arrives_in_the_next_step_and_one_gap_later_and_moves_nothing():
-    envs, seen = made("sent")
-    other, _ = made("heard")
-    size = plain_rows(envs).shape[1]
-    assert envs.action_space.shape == (arms.TWIST + arms.MESSAGE,)
-    assert not seen[:, size:].any()
-    messages = []
-    for step in range(HORIZON - 1):
-        actions = actions_of(envs, step) * 1.5  # beyond the range they are clipped
-        messages.append(ahead(np.clip(actions[:, arms.TWIST :], -1, 1).astype(np.float32)))
-        seen = envs.step(actions)[0]
-        late = messages[step + 1 - GAP] if step + 1 >= GAP else np.zeros_like(messages[0])
-        np.testing.assert_array_equal(seen[:, size:], np.concatenate([messages[-1], late], axis=1))
-        np.testing.assert_array_equal(other.step(actions[:, : arms.TWIST])[0], plain_rows(envs))
-    assert not envs.step(actions)[0][:, size:].any()  # the next episode
-
-
 def test_the_own_arm_has_nothing_of_the_predecessor_and_all_the_rest():
     envs, seen = made("own")
     _, rows = made("heard")
@@ -117,7 +100,7 @@ def test_the_own_arm_has_nothing_of_the_predecessor_and_all_the_rest():
     np.testing.assert_array_equal(seen[:, ~of_predecessor], rows[:, ~of_predecessor])
 
 
-@pytest.mark.parametrize("name", ["own", "heard", "shared", "sent"])
+@pytest.mark.parametrize("name", ["own", "heard", "shared"])
 def test_a_policy_sees_in_a_run_what_its_environments_showed(name):
     envs, seen = made(name)
     scenario = envs.plants[0].scenario
@@ -133,7 +116,7 @@ def test_a_policy_sees_in_a_run_what_its_environments_showed(name):
         acted, state = policy.predict(plain_rows(envs), state, start)
         np.testing.assert_array_equal(shown[-1], seen)
         actions = actions_of(envs, step).astype(np.float32)
-        np.testing.assert_array_equal(acted, actions[:, : arms.TWIST])
+        np.testing.assert_array_equal(acted, actions)
         seen, _, start, _ = envs.step(actions)
 
 

@@ -33,7 +33,6 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 from neighbours_arms import (
     ARMS,
-    TWIST,
     Arm,
     CorrectingPolicy,
     RowPolicy,
@@ -132,10 +131,6 @@ def train_arm(name: str, seeds: Sequence[int], trained: Path) -> None:
         began_s = time.process_time()
         envs = RowVecEnv(tasks, config.formations, arm=arm, mixture=shares, infos=False)
         model = make_model(config, envs, seed)
-        if arm.sees == "sent":
-            # Only the twist begins near 0: a message that is always 0 says nothing.
-            with torch.no_grad():
-                model.policy.action_net.weight[TWIST:] /= config.network.action_gain
         spread_out(model, envs, config.seeds[0])
         while model.num_timesteps < config.robot_steps:
             set_learning_rate(model, config)
@@ -267,7 +262,7 @@ def foreseen(
         for sees, sight in sights.items():
             if step >= first and step % PROBE_EVERY == 0:
                 seen[sees].append(sight.seen(present)[~leaders])
-            sight.note(present, present[:, :0])
+            sight.note(present)
         if step >= first and step % PROBE_EVERY == 0:
             errors.append(present[~leaders][:, wanted])
         plant.step(driver.act())
@@ -488,7 +483,8 @@ def main() -> None:
             train_arm(arm, seeds, given.trained)
             return
         case ["judge"]:
-            for name in (given.only,) if given.only else (*LAWS, *ARMS):
+            every = (*LAWS, *(name for name in ARMS if (given.trained / name).exists()))
+            for name in (given.only,) if given.only else every:
                 rows = joined(rows, judge_arm(name, seeds, given.trained))
                 keep(rows)
         case ["probe"]:

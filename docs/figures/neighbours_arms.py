@@ -13,8 +13,6 @@ from tlf_env.onboard.parts import Policy
 from tlf_env.task.observation import OBSERVATION_LIMIT, TRACKING_ENTRIES
 from tlf_env.task.scenario import Scenario
 
-TWIST = 2  # entries of an action that move the robot; messages follow
-MESSAGE = 4  # entries of a message
 OF_PREDECESSOR = "predecessor_"
 ERROR = ("e_1", "e_2", "e_1_fine", "e_2_fine")
 MOST_MM = 20.0  # of a correction, forward and to the right: a start is not corrected
@@ -23,7 +21,7 @@ MOST_MM = 20.0  # of a correction, forward and to the right: a start is not corr
 class Arm(NamedTuple):
     """What a training differs in."""
 
-    sees: str  # own, heard, shared or sent
+    sees: str  # own, heard or shared
     neighbour: bool = False  # hear one more robot
 
 
@@ -91,8 +89,7 @@ class Sight:
     ----------
     sees
         own: without the entries of the predecessor; heard: as it is; shared: also the whole observation of the
-        predecessor, now and one gap ago; sent: also the predecessor's message of the last control step and
-        of one gap ago.
+        predecessor, now and one gap ago, without loss or delay.
     scenario
         Of the task: its entries and its gap.
     leaders
@@ -104,31 +101,24 @@ class Sight:
         names = entry_names(scenario)
         self._entries, self._gap = len(names), gap_steps(scenario)
         self._of_predecessor = [name.startswith(OF_PREDECESSOR) for name in names]
-        kept = {"shared": self._entries, "sent": MESSAGE}.get(sees, 0)
+        kept = self._entries if sees == "shared" else 0
         self._earlier = Earlier(self._gap, len(self._leaders), kept)
         self.width = self._entries + 2 * kept
 
     def seen(self, present: np.ndarray) -> np.ndarray:
         """What the network sees beside present observations ``(row, entry)``; a copy."""
-        match self._sees:
-            case "own":
-                return np.where(self._of_predecessor, 0.0, present).astype(present.dtype)
-            case "heard":
-                return present.copy()
-            case "shared":
-                last = present
-            case _:
-                last = self._earlier.ago(1)
+        if self._sees == "own":
+            return np.where(self._of_predecessor, 0.0, present).astype(present.dtype)
+        if self._sees == "heard":
+            return present.copy()
         late = self._earlier.ago(self._gap)
-        parts = [present, ahead(last, self._leaders), ahead(late, self._leaders)]
+        parts = [present, ahead(present, self._leaders), ahead(late, self._leaders)]
         return np.concatenate(parts, axis=1)
 
-    def note(self, present: np.ndarray, messages: np.ndarray) -> None:
-        """Keep what a step began with, and the messages that were sent in it."""
+    def note(self, present: np.ndarray) -> None:
+        """Keep what a step began with."""
         if self._sees == "shared":
             self._earlier.note(present)
-        elif self._sees == "sent":
-            self._earlier.note(messages)
 
     def clear(self, rows: np.ndarray) -> None:
         """An episode begins in the rows of a mask."""
@@ -137,8 +127,6 @@ class Sight:
 
 class RowVecEnv(FormationVecEnv):
     """Formations whose robots see what they see in an arm.
-
-    In the arm that sends, an action has :data:`MESSAGE` further entries. They move nothing and cost nothing.
 
     Parameters
     ----------
@@ -160,40 +148,30 @@ class RowVecEnv(FormationVecEnv):
                     f"task {first.time_gap_s:g}; tasks in one environment need the same"
                 )
         self.sight = Sight(arm.sees, first, self._leaders)
-        self._messages = np.zeros((self.num_envs, MESSAGE), dtype=np.float32)
         kind: Any = self.observation_space.dtype
         limit = OBSERVATION_LIMIT
         self.observation_space = gymnasium.spaces.Box(-limit, limit, (self.sight.width,), kind.type)
-        if arm.sees == "sent":
-            self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (TWIST + MESSAGE,), kind.type)
 
     def observations(self) -> np.ndarray:
         """As its base, with what the arm adds, ``(num_envs, entries)``; a copy."""
         return self.sight.seen(super().observations())
 
     def reset(self) -> np.ndarray:
-        """As its base; nothing was seen or sent before."""
+        """As its base; nothing was seen before."""
         self.sight.clear(np.ones(self.num_envs, dtype=np.bool_))
         return super().reset()
 
     def begin_next(self, plant: int, mask: np.ndarray) -> None:
-        """As its base; the robots of these formations have seen and sent nothing."""
+        """As its base; the robots of these formations have seen nothing."""
         super().begin_next(plant, mask)
         begun = np.zeros(self.num_envs, dtype=np.bool_)
         robots = self.plants[plant].scenario.robot_count
         begun[self._ends[plant] : self._ends[plant + 1]] = np.repeat(mask, robots)
         self.sight.clear(begun)
 
-    def step_async(self, actions: np.ndarray) -> None:
-        """Keep the actions for the step, and pass the messages on."""
-        if self._arm.sees == "sent":
-            self._messages = np.clip(actions[:, TWIST:], -1.0, 1.0)
-        super().step_async(actions[:, :TWIST])
-
     def step_wait(self) -> tuple[np.ndarray, np.ndarray, np.ndarray, list[dict[str, Any]]]:
         """As its base; an episode's last observation has what came before, the next one's first has nothing."""
-        self.sight.note(super().observations(), self._messages)
-        # The base starts the next episodes within the step: what they replace has to be added here.
+        self.sight.note(super().observations())
         observations, rewards, dones, infos = super().step_wait()
         if dones.any():
             self.sight.clear(dones)
@@ -224,8 +202,8 @@ class RowPolicy:
         if episode_start is not None and episode_start.any():
             state.clear(episode_start)
         actions, _ = self._model.predict(state.seen(observation), deterministic=deterministic)
-        state.note(observation, actions[:, TWIST:])
-        return actions[:, :TWIST], state
+        state.note(observation)
+        return actions, state
 
 
 class CorrectingPolicy:
