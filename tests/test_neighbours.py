@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib
+import json
 import sys
 from types import SimpleNamespace
 
@@ -163,3 +164,66 @@ def test_a_correction_is_the_predecessors_error_of_one_gap_ago(relayed):
                 wanted[:, names.index(f"e_{i}{kind}")] += heard[:, i - 1] / scale
         np.testing.assert_allclose(seen[step], wanted, rtol=1e-4, atol=1e-4)
     assert (np.abs(sent_mm) > 0.1).any()
+
+
+# --- the section of the page ---------------------------------------------------------------------
+
+script = importlib.import_module("make_neighbours")
+PAGE = (DOCS / "learning.md").read_text(encoding="utf-8")
+SECTION = PAGE.split("## Neighbours and messages\n")[1].split("\n## ")[0]
+TEXT = " ".join(SECTION.split())
+ROWS = json.loads(script.RESULTS.read_text(encoding="utf-8"))
+NAMES = [cell.name for cell in script.CELLS]
+OWN, PATH, OWN_GROWTH, PATH_GROWTH = script.MEASURES
+
+
+def median(cell, arm, measure):
+    return float(np.nanmedian(script.measured(ROWS, cell, arm, measure)))
+
+
+def apart(cell, arm, other, measure):
+    found = (script.measured(ROWS, cell, name, measure) for name in (arm, other))
+    return script.difference(*found)
+
+
+def test_the_tables_are_those_of_the_kept_runs():
+    for name, text in script.tables(ROWS).items():
+        assert f"<!-- {name} -->\n{text}\n<!-- end of {name} -->" in SECTION, name
+
+
+def test_every_arm_has_three_trainings_and_the_same_runs():
+    for arm in ("own", "heard", "shared"):
+        for cell in script.CELLS:
+            mine = script.of(ROWS, cell.name, arm)
+            assert [row["seed"] for row in mine] == [0, 1, 2]
+            for row in mine:
+                assert np.shape(row["row_mm"]) == (cell.most_runs, cell.robots)
+                assert np.shape(row["path_mm"]) == (cell.most_runs, cell.robots)
+                assert len(row["failed"]) == cell.most_runs
+    assert min(script.PROBE_RUNS) == 0
+    assert max(script.PROBE_RUNS) == script.FIRST_TABLE_SEED
+
+
+def test_growth_is_the_factor_of_a_geometric_row():
+    errors = 3.0 * 1.2 ** np.arange(6.0) * np.ones((2, 4, 1))
+    errors[:, :, 0] = 100.0  # the leader does not count
+    np.testing.assert_allclose(script.growth(errors), 1.2)
+
+
+def shares(disturbance, sees):
+    return script.of(ROWS, f"probe, {disturbance}", sees)[0]["explained"]
+
+
+def test_the_predecessor_shows_hardly_anything_of_the_next_error():
+    for place in (0, 1):
+        assert shares("slip", "shared")[place] < shares("slip", "own")[place]
+        more = shares("patches", "shared")[place] - shares("patches", "own")[place]
+        assert 0 <= more < 0.02
+
+
+def test_messages_of_two_numbers_pay_in_every_row():
+    for cell in NAMES:
+        hop, relayed = (apart(cell, arm, "base", PATH) for arm in ("hop", "relayed"))
+        assert relayed.high < 0
+        assert hop.high < 0
+        assert relayed.median < hop.median
