@@ -227,3 +227,50 @@ def test_messages_of_two_numbers_pay_in_every_row():
         assert relayed.high < 0
         assert hop.high < 0
         assert relayed.median < hop.median
+
+
+def test_what_the_messages_gain_and_cost():
+    slip, patches, row = NAMES
+    for cell, words in (
+        (slip, "{} in place of {} mm from"),
+        (patches, "{} in place of {} mm under"),
+    ):
+        found = [f"{median(cell, arm, PATH):.1f}" for arm in ("relayed", "base")]
+        assert words.format(*found) in TEXT
+    found = [f"{median(row, arm, PATH):.1f}" for arm in ("relayed", "base")]
+    assert "and {} in place of {} mm in the row of ten".format(*found) in TEXT
+    gained = sorted(-apart(cell, "hop", "base", PATH).median for cell in NAMES)
+    assert f"`hop` gains {gained[0]:.1f} to {gained[-1]:.1f} mm" in TEXT
+    for cell in (slip, row):
+        for arm in ("hop", "relayed"):
+            assert apart(cell, arm, "base", OWN).low > 0
+    lost = {(row["cell"], row["arm"]): sum(row["failed"]) for row in ROWS if "failed" in row}
+    assert {key for key, count in lost.items() if count} == {(slip, "hop"), (slip, "relayed")}
+    for arm in ("hop", "relayed"):
+        only = script.of(ROWS, slip, arm)[0]
+        assert sum(only["failed"]) == 1
+        assert only["row_mm"][only["failed"].index(1)][-1] == pytest.approx(240, abs=5)
+
+
+def test_all_that_the_predecessor_observes_gains_nothing_clear():
+    found = [apart(cell, "shared", "heard", OWN) for cell in NAMES]
+    assert all(one.low < 0 < one.high for one in found)
+    found = [apart(cell, "shared", "heard", PATH) for cell in NAMES]
+    assert all(one.low < 0 < one.high for one in found)
+
+
+def test_one_slip():
+    moved = {arm: script.of(ROWS, "kick", arm)[0]["moved_mm"] for arm in script.arms_in(ROWS)}
+    for arm in ("base", "own", "heard", "shared"):
+        ratio = moved[arm][-1] / moved[arm][2]
+        assert 0.8 <= ratio < 0.95
+        assert 0.97 <= ratio ** (1 / 7) <= 0.99
+    assert moved["hop"][2] / moved["base"][2] == pytest.approx(2 / 3, abs=0.03)
+    assert moved["hop"][-1] / moved["hop"][2] > 0.95
+    last = (moved["relayed"][-1], moved["base"][-1])
+    assert "moves by {:.1f} in place of {:.1f} mm".format(*last) in TEXT
+
+
+def test_costs():
+    minutes = [row["minutes"] for row in ROWS if row["cell"] == "training"]
+    assert f"took {min(minutes):.1f} to {max(minutes):.1f} minutes" in TEXT
