@@ -274,3 +274,37 @@ def test_one_slip():
 def test_costs():
     minutes = [row["minutes"] for row in ROWS if row["cell"] == "training"]
     assert f"took {min(minutes):.1f} to {max(minutes):.1f} minutes" in TEXT
+
+
+def test_the_message_of_the_predecessor_gains_nothing_clear():
+    slip = NAMES[0]
+    for cell in NAMES:
+        one = apart(cell, "heard", "own", OWN)
+        assert one.low < 0 < one.high
+    farther = apart(slip, "heard", "own", PATH)
+    assert farther.low > 0
+    assert f"by {farther.median:.1f} mm (second table)" in TEXT
+    ends = {}
+    for cell in NAMES:
+        for arm in ("own", "heard", "shared"):
+            assert median(cell, arm, OWN_GROWTH) < 1.055
+            found = script.measured(ROWS, cell, arm, OWN_GROWTH)
+            ends[cell, arm] = script.difference(found, np.zeros((1, found.shape[1])))
+        lows, highs = zip(*(ends[cell, arm][1:] for arm in ("own", "heard", "shared")), strict=True)
+        assert max(lows) < min(highs)
+
+
+def test_where_shared_has_the_smaller_medians_and_the_less_precise_leader():
+    slip, patches, row = NAMES
+    for cell in (slip, patches):
+        assert 0.05 < -apart(cell, "shared", "heard", OWN).median < 0.2
+    assert apart(row, "shared", "heard", OWN).median > 0
+    assert -min(apart(cell, "shared", "heard", OWN).low for cell in NAMES) == pytest.approx(
+        0.3, abs=0.05
+    )
+    for cell in NAMES:
+        leaders = [
+            np.nanmedian(script.errors_mm(ROWS, cell, arm, "row_mm")[:, :, 0])
+            for arm in ("shared", "heard")
+        ]
+        assert leaders[0] > leaders[1]
