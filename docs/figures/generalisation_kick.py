@@ -24,8 +24,8 @@ KICK = "10 robots, one slips once"  # the name of its kept lines
 PLACES = [Info._fields.index(name) for name in ("x_mm", "y_mm")]
 
 
-def row_scenario() -> Scenario:
-    """A row of ten on the long circle, whose channels can be set while it drives."""
+def row_scenario(**fields: Any) -> Scenario:
+    """A row of ten on the long circle, whose channels can be set while it drives; with further fields."""
     return load_scenario(
         "long_circle",
         robots=ROBOTS,
@@ -33,6 +33,7 @@ def row_scenario() -> Scenario:
         disturbance="nominal",
         adversary=True,
         end_on=(),
+        **fields,
     )
 
 
@@ -57,19 +58,19 @@ def positions_mm(scenario: Scenario, policy: Policy, seed: int, slips: bool) -> 
     return found
 
 
-def displacements_mm(entry: str, seed: int) -> np.ndarray:
+def displacements_mm(scenario: Scenario, policy: Policy, seed: int) -> np.ndarray:
     """The largest distance of each robot from where it is without the slip; all draws are the same."""
-    found = fit_policy(ENTRIES[entry], row_scenario())
-    with_slip, without = (
-        positions_mm(found.scenario, found.policy, seed, slips) for slips in (True, False)
-    )
+    with_slip, without = (positions_mm(scenario, policy, seed, slips) for slips in (True, False))
     distance: Any = np.linalg.norm(with_slip - without, axis=2)
     return np.max(distance, axis=0)
 
 
 def kicked(entry: str) -> Line:
     """The kept line of an entry: the median over the seeds for each robot."""
-    all_mm = np.median([displacements_mm(entry, seed) for seed in SEEDS], axis=0)
+    found = fit_policy(ENTRIES[entry], row_scenario())
+    all_mm = np.median(
+        [displacements_mm(found.scenario, found.policy, one) for one in SEEDS], axis=0
+    )
     return {
         "table": "kick",
         "cell": KICK,

@@ -69,9 +69,9 @@ def rms_mm(values: np.ndarray) -> list[float]:
     return [rounded(one) for one in np.sqrt(np.mean(values**2, axis=0))]
 
 
-def along_row(record: Record) -> Line:
-    """Errors of every robot of a long row, from the time at which all of them drive."""
-    first_s = (record.robots - 1) * ROW_GAP_S + ROW_SETTLE_S
+def along_row(record: Record, settle_s: float = ROW_SETTLE_S) -> Line:
+    """Errors of every robot of a long row, from the time at which the last one has driven for so long."""
+    first_s = (record.robots - 1) * ROW_GAP_S + settle_s
     whole = record.t_s >= first_s
     return {
         "row_mm": rms_mm(record["position_error_mm"][whole]),
