@@ -19,7 +19,7 @@ from tlf_env.task.scenario import Scenario
 BATCH = 2048
 
 
-class Rows(NamedTuple):
+class ImitationRows(NamedTuple):
     """One round, a row for each robot and step."""
 
     seen: np.ndarray  # observations
@@ -55,7 +55,7 @@ def imitate(model: Any, envs: FormationVecEnv, config: TrainConfig) -> None:
     check_interface("the teacher", scenario, action="twist", observation="tracking")
     teacher = free_teacher(wanted.controller, scenario)
     generator = np.random.default_rng(model.seed)
-    rows: list[Rows] = []
+    rows: list[ImitationRows] = []
     for round_ in range(wanted.rounds):
         driver = teacher if round_ == 0 else model
         rows.append(_drive(model, envs, driver, teacher, wanted, generator))
@@ -76,7 +76,7 @@ def free_teacher(name: str, scenario: Scenario) -> ReferencePolicy:
     return ReferencePolicy(known, scenario.control_period_s, scenario.preview_s)
 
 
-def _from_data(path: Path, scenario: Scenario, gamma: float) -> Rows:
+def _from_data(path: Path, scenario: Scenario, gamma: float) -> ImitationRows:
     """The rows of a data set, which must have the scenario's observation and action."""
     data = fitting_rows(path, scenario)
     returns = np.empty(len(data.rewards), dtype=np.float32)
@@ -84,7 +84,7 @@ def _from_data(path: Path, scenario: Scenario, gamma: float) -> Rows:
     for k in reversed(range(len(returns))):
         following = data.rewards[k] + gamma * (0.0 if data.last[k] else following)
         returns[k] = following
-    return Rows(data.observations, data.actions, returns)
+    return ImitationRows(data.observations, data.actions, returns)
 
 
 def _drive(
@@ -94,7 +94,7 @@ def _drive(
     teacher: ReferencePolicy,
     wanted: ImitationConfig,
     generator: np.random.Generator,
-) -> Rows:
+) -> ImitationRows:
     """Observations while ``driver`` drives, the teacher's actions for them, and the returns."""
     steps = -(-wanted.robot_steps // (envs.num_envs * wanted.rounds))
     shape = (steps, envs.num_envs)
@@ -114,7 +114,7 @@ def _drive(
     model._last_episode_starts = np.asarray(dones[-1])
     returns = returns_of(rewards, dones, model.gamma)
     count = steps * envs.num_envs
-    return Rows(seen.reshape(count, -1), meant.reshape(count, -1), returns.ravel())
+    return ImitationRows(seen.reshape(count, -1), meant.reshape(count, -1), returns.ravel())
 
 
 def returns_of(rewards: np.ndarray, dones: np.ndarray, gamma: float) -> np.ndarray:

@@ -17,6 +17,9 @@ from tlf_env.engine.arrays import Arrays
 from tlf_env.task.observation import OBSERVATION_LIMIT
 
 CRITIC_HIDDEN = 64
+# What the head's weights are multiplied with, so that those for small corrections are about 1, as an optimiser
+# expects them.
+ACTION_SCALE = 0.01
 # What of the truth the critic sees, and what is scaled to 1; errors in three scales, as in the sensor layer.
 TRUTH_SCALES = {
     "e_1": (500.0, 100.0, 10.0),
@@ -117,7 +120,8 @@ class SensorExtractor(nn.Module):
     def of_features(self, features: torch.Tensor) -> torch.Tensor:
         """What the actor's head sees, from :meth:`features`."""
         split = len(self.first)
-        return torch.cat([self.policy_net(features[:, :split]), features[:, split:]], dim=1)
+        inner = ACTION_SCALE * self.policy_net(features[:, :split])
+        return torch.cat([inner, features[:, split:]], dim=1)
 
     def forward_actor(self, seen: torch.Tensor) -> torch.Tensor:
         """What the actor's head sees."""
@@ -143,6 +147,10 @@ class SensorPolicy(ActorCriticPolicy):
     def __init__(self, *args: Any, layer: SensorLayer, **kwargs: Any) -> None:
         self.layer = layer
         super().__init__(*args, **kwargs)
+        # The wheel speeds of the reference's twist are known, and not trained.
+        trained = torch.ones_like(self.action_net.weight)
+        trained[:, -len(layer.twist) :] = 0.0
+        self.action_net.weight.register_hook(lambda gradient: gradient * trained)
 
     def begin_at_reference(self) -> None:
         """Let the wheels do what the reference's twist needs, besides what the other layers say."""
@@ -186,6 +194,7 @@ class SensorPolicy(ActorCriticPolicy):
                 Dense(_beside(weight, np.eye(carried)), np.concatenate([bias, np.zeros(carried)]))
             )
         weight, bias = _dense(self.action_net)
+        weight[:, :-carried] *= ACTION_SCALE
         layers.append(Dense(weight, bias - limit * weight[:, -carried:].sum(axis=1)))
         return [Dense(*(part.astype(np.float32) for part in layer)) for layer in layers]
 
