@@ -37,13 +37,18 @@ CONFIG = {
         "horizon_s": 2.0,
     },
 }
+WITH_A_BUFFER = {
+    "robot_steps": 2400,
+    "checkpoint_every": 768,
+    "settings": {"buffer_size": 2000, "learning_starts": 100, "batch_size": 32},
+}
 ALGORITHMS = {
     "PPO": {},
-    "SAC": {
+    **{name: {"algorithm": name, **WITH_A_BUFFER} for name in ("SAC", "TQC", "CrossQ")},
+    "SAC with a fixed entropy coefficient": {
         "algorithm": "SAC",
-        "robot_steps": 2400,
-        "checkpoint_every": 768,
-        "settings": {"buffer_size": 2000, "learning_starts": 100, "batch_size": 32},
+        **WITH_A_BUFFER,
+        "settings": {**WITH_A_BUFFER["settings"], "ent_coef": 0.01, "n_steps": 3},
     },
     "PPO with a curriculum": {
         "curriculum": {"failed_share": 0.9},
@@ -68,7 +73,10 @@ def test_shipped_configs_are_valid(path: Path):
 @pytest.mark.parametrize(
     ("changes", "said"),
     [
-        ({"algorithm": "A2C"}, "algorithm: Input should be 'PPO', 'SAC' or 'RecurrentPPO'"),
+        (
+            {"algorithm": "A2C"},
+            "algorithm: Input should be 'PPO', 'SAC', 'TQC', 'CrossQ' or 'RecurrentPPO'",
+        ),
         ({"robot_steps": 0}, "robot_steps: Input should be greater than or equal to 1, got 0"),
         ({"rollouts": 3}, "rollouts: unknown key"),
         (
@@ -205,7 +213,12 @@ class TestTraining:
             assert (parts / CHECKPOINT_FILE).exists()
         again = train(config, 3, parts)
         for curve in (whole, again):
-            del curve["wall_time_s"]
+            times_s = curve.pop("evaluated_at_s")
+            assert len(times_s) == len(curve["evaluations"])
+            assert times_s == sorted(times_s)
+            assert times_s[0] > 0
+            assert times_s[-1] <= curve.pop("processor_time_s")
+            assert curve.pop("wall_time_s") > 0
         assert whole == again
         assert len(whole["evaluations"]) >= 3
         assert (parts / POLICY_FILE).read_bytes() == (tmp_path / "whole" / POLICY_FILE).read_bytes()

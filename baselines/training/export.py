@@ -13,6 +13,7 @@ from baselines.policies.card import WEIGHTS, Card, write_policy
 from baselines.policies.learned import LearnedPolicy, load_policy
 from baselines.policies.network import Network
 from baselines.runs.provenance import installed_versions, versions
+from baselines.training.config import ALGORITHMS
 from baselines.training.history import ModelPolicy, history_of
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import OBSERVATION_LIMIT
@@ -22,7 +23,7 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 TRAINERS = ("torch", "stable-baselines3", "sb3-contrib")
-ALGORITHMS = ("PPO", "SAC", "RecurrentPPO")
+NORMALISING = "BatchRenorm1d"  # the layer of CrossQ before each dense one
 AGREEMENT = 1e-5  # largest difference between an action of the model and of its copy
 CHECKED_ROWS, CHECKED_STEPS = 32, 4
 
@@ -45,10 +46,11 @@ def export_policy(
     Parameters
     ----------
     model
-        SB3's PPO or SAC or sb3-contrib's RecurrentPPO with an ``MlpPolicy`` (``MlpLstmPolicy``, one
-        layer): tanh or ReLU, no gSDE, actions in [−1, 1]². The statistics of a ``VecNormalize`` that
-        normalises observations are exported, too, and the history of a
-        :class:`~baselines.training.history.HistoryVecEnv`.
+        SB3's PPO or SAC or sb3-contrib's TQC, CrossQ or RecurrentPPO with an ``MlpPolicy``
+        (``MlpLstmPolicy``, one layer): tanh or ReLU, no gSDE, actions in [−1, 1]². The statistics of a
+        ``VecNormalize`` that normalises observations are exported, too, and the history of a
+        :class:`~baselines.training.history.HistoryVecEnv`. CrossQ's normalisation within the network
+        becomes part of the layers behind it.
     path
         Ends in ``.safetensors``.
     scenario
@@ -96,13 +98,12 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
         raise ValueError(f"the model's actions must be a Box of [−1, 1]², got {box}")
     if getattr(model, "use_sde", False):
         raise ValueError("a model with gSDE cannot be exported")
-    if type(model).__name__ == "SAC":
-        actor = model.policy.actor
-        hidden, mean = actor.latent_pi, actor.mu
-        tensors = _dense("log_std", actor.log_std)
-    else:
+    actor = actor_of(model)
+    if actor is None:
         hidden, mean = model.policy.mlp_extractor.policy_net, model.policy.action_net
-        tensors = {"log_std": _array(model.policy.log_std)}
+        heads, tensors = {"mean": mean}, {"log_std": _array(model.policy.log_std)}
+    else:
+        hidden, heads, tensors = actor.latent_pi, {"mean": actor.mu, "log_std": actor.log_std}, {}
     lstm = getattr(model.policy, "lstm_actor", None)
     if lstm is not None:
         if lstm.num_layers != 1:
@@ -111,15 +112,14 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
             )
         for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
             tensors[f"lstm.{name}"] = _array(getattr(lstm, f"{name}_l0"))
-    layers, activations = list(hidden)[::2], {type(one).__name__ for one in list(hidden)[1::2]}
+    chain = [one for one in hidden if type(one).__name__ != NORMALISING]
+    layers, activations = chain[::2], {type(one).__name__ for one in chain[1::2]}
     linear = all(type(layer).__name__ == "Linear" for layer in layers)
-    if not linear or len(hidden) % 2 or activations not in (set(), {"Tanh"}, {"ReLU"}):
+    if not linear or len(chain) % 2 or activations not in (set(), {"Tanh"}, {"ReLU"}):
         raise ValueError(
             f"hidden layers must be linear with tanh or with ReLU, got {' '.join(str(hidden).split())}"
         )
-    for i, layer in enumerate(layers):
-        tensors |= _dense(f"hidden.{i}", layer)
-    tensors |= _dense("mean", mean)
+    tensors |= _folded(hidden, heads)
     history = history_of(model)
     if history is not None and lstm is not None:
         raise ValueError("a model with an LSTM and a history cannot be exported")
@@ -137,14 +137,46 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
         activation="relu" if "ReLU" in activations else "tanh",
         history=history,
         lstm=None if lstm is None else lstm.hidden_size,
-        head="squashed_gaussian" if type(model).__name__ == "SAC" else "gaussian",
+        head="gaussian" if actor is None else "squashed_gaussian",
         normalised=normalised,
     )
     return network, tensors
 
 
-def _dense(name: str, layer: Any) -> dict[str, np.ndarray]:
-    return {f"{name}.weight": _array(layer.weight), f"{name}.bias": _array(layer.bias)}
+def actor_of(model: Any) -> Any:
+    """The actor of an algorithm with a replay buffer: ``latent_pi``, ``mu`` and ``log_std``; None for PPO's."""
+    return getattr(model.policy, "actor", None)
+
+
+def _folded(hidden: Iterable[Any], heads: Mapping[str, Any]) -> dict[str, np.ndarray]:
+    """Tensors of the hidden layers and the heads, with the normalisation before each of them in it.
+
+    Once a network is trained, its normalisation is y = a·x + b for each unit, so that W·y + c is
+    (W·a)·x + (W·b + c): one layer.
+    """
+    tensors: dict[str, np.ndarray] = {}
+    scale: Any = 1.0
+    shift: Any = 0.0
+
+    def keep(name: str, layer: Any) -> None:
+        weight = _array(layer.weight).astype(np.float64)
+        bias = _array(layer.bias) + weight @ np.broadcast_to(shift, weight.shape[1])
+        tensors[f"{name}.weight"] = (weight * scale).astype(np.float32)
+        tensors[f"{name}.bias"] = bias.astype(np.float32)
+
+    layers = 0
+    for one in hidden:
+        kind = type(one).__name__
+        if kind == NORMALISING:
+            mean, var = (_array(part).astype(np.float64) for part in (one.ra_mean, one.ra_var))
+            scale = _array(one.scale) / np.sqrt(var + one.eps)
+            shift = _array(one.bias) - scale * mean
+        elif kind == "Linear":
+            keep(f"hidden.{layers}", one)
+            layers, scale, shift = layers + 1, 1.0, 0.0
+    for name, head in heads.items():
+        keep(name, head)
+    return tensors
 
 
 def _array(tensor: Any) -> np.ndarray:

@@ -12,6 +12,7 @@ from stable_baselines3 import PPO, SAC
 
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import TrainConfig
+from baselines.training.export import actor_of
 from baselines.training.history import HistoryVecEnv
 from tlf_env.common.errors import install_command
 from tlf_env.task.warn import without_warnings
@@ -58,13 +59,11 @@ def make_model(config: TrainConfig, envs: FormationVecEnv, seed: int) -> Any:
     policy: dict[str, Any] = {
         "net_arch": layers,
         "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network.activation],
-        "log_std_init": network.initial_log_std,
+        "log_std_init": network.initial_log_std,  # with an actor of its own it has no effect
     }
     make, kind = algorithm(config)
     if network.lstm is not None:
         policy |= {"lstm_hidden_size": network.lstm}
-    if config.algorithm == "SAC":
-        del policy["log_std_init"]  # SAC computes it by a head
     known = set(inspect.signature(make).parameters) - {"policy", "env", "seed"}
     for name in config.settings:
         if name not in known:
@@ -73,10 +72,14 @@ def make_model(config: TrainConfig, envs: FormationVecEnv, seed: int) -> Any:
         model = make(kind, envs, policy_kwargs=policy, seed=seed, device="cpu", **config.settings)
     except (TypeError, AssertionError) as error:
         raise ValueError(f"settings: {config.algorithm} refuses them: {error}") from error
-    head = model.actor.mu if config.algorithm == "SAC" else model.policy.action_net
+    actor = actor_of(model)
+    head = model.policy.action_net if actor is None else actor.mu
     with torch.no_grad():
         head.weight.mul_(network.action_gain)
         head.bias.mul_(network.action_gain)
+        if actor is not None:  # its deviation is the output of a head, too
+            actor.log_std.weight.mul_(network.action_gain)
+            actor.log_std.bias.fill_(network.initial_log_std)
     return model
 
 
@@ -88,13 +91,15 @@ def algorithm(config: TrainConfig) -> tuple[Callable[..., Any], str]:
     ValueError
         if its package is missing.
     """
-    if config.algorithm != "RecurrentPPO":
-        return {"PPO": PPO, "SAC": SAC}[config.algorithm], "MlpPolicy"
+    name = config.algorithm
+    own: dict[str, Callable[..., Any]] = {"PPO": PPO, "SAC": SAC}
+    if name in own:
+        return own[name], "MlpPolicy"
     try:
-        from sb3_contrib import RecurrentPPO
+        import sb3_contrib
     except ModuleNotFoundError as error:
-        raise ValueError(f"RecurrentPPO needs sb3-contrib ({install_command('train')})") from error
-    return RecurrentPPO, "MlpLstmPolicy"
+        raise ValueError(f"{name} needs sb3-contrib ({install_command('train')})") from error
+    return getattr(sb3_contrib, name), "MlpLstmPolicy" if name == "RecurrentPPO" else "MlpPolicy"
 
 
 def spread_out(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
@@ -122,7 +127,7 @@ def spread_out(model: Any, envs: FormationVecEnv, first_seed: int) -> None:
 
 
 def rollout_steps(model: Any) -> int:
-    """Robot steps of one call of ``learn``: PPO's rollout; SAC updates many times during the call."""
+    """Robot steps of one call of ``learn``: PPO's rollout; the others update many times during the call."""
     steps = OFF_POLICY_STEPS if hasattr(model, "replay_buffer") else model.n_steps
     return int(steps) * int(model.n_envs)
 

@@ -1,0 +1,261 @@
+"""Compare learning algorithms on one task: the table and the figure of *Algorithms* in ``docs/learning.md``.
+
+First train, for example ``tlf train scratch --seeds 0,1,2``; then ``python docs/figures/make_algorithms.py``.
+It needs the extra ``figures``. Every policy of :data:`ENTRIES` that is found in ``results/train`` drives
+:data:`CELLS` on seeds that nothing was tuned on; what is found is kept in ``docs/learning/algorithms.json``
+by the digest of the policy's file, so that a policy is driven only once. An entry that was trained on another
+machine keeps its rows, and one without any training is left out. Table and figure are made from that file
+alone (``--kept``).
+
+To add an algorithm: a folder ``results/train/NAME/seed_N`` with ``policy.safetensors``, its card and
+``curve.json`` for each training seed, and a line in :data:`ENTRIES`. Of the curve these are read:
+``evaluations`` with ``robot_steps`` and ``score_mm``, ``wall_time_s``, and, if they are there,
+``processor_time_s`` and ``evaluated_at_s`` (:class:`baselines.training.curve.TrainingProgress`).
+"""
+
+from __future__ import annotations
+
+import argparse
+import hashlib
+import json
+from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import matplotlib
+import numpy as np
+from make_board import DOCS
+from make_figures import BLUE, GREEN, GREY, ORANGE, RED, STYLE
+from make_parts import put
+from make_speed import table
+from matplotlib.figure import Figure
+
+from baselines.policies.registry import fit_policy
+from baselines.runs.outcome import failed
+from baselines.runs.run import run_seeds
+from baselines.runs.seed_ranges import FIRST_TABLE_SEED
+from tlf_env.common.files import atomic
+from tlf_env.task.scenario import load_scenario
+
+PAGE, RESULTS, PICTURE = (
+    DOCS / "learning.md",
+    DOCS / "learning" / "algorithms.json",
+    DOCS / "learning" / "algorithms.png",
+)
+TRAINED = Path("results/train")
+POLICY_FILE, CARD_FILE, CURVE_FILE = "policy.safetensors", "policy.json", "curve.json"
+DEFAULT = "reference:linearised"
+HORIZON_S, RUNS = 60.0, 100
+MILLION = 1e6
+
+
+class Entry(NamedTuple):
+    """A training of the comparison, by the name of its folder, and how it is drawn."""
+
+    name: str
+    label: str
+    colour: str = GREY
+    line: str = "-"
+
+
+# The order of the rows. Those that were not trained are left out.
+ENTRIES = (
+    Entry("scratch", "PPO, `scratch`", BLUE, "-"),
+    Entry("sac-scratch", "SAC, `sac-scratch`", ORANGE, "--"),
+    Entry("tqc-scratch", "TQC, `tqc-scratch`", GREEN, "-."),
+    Entry("crossq-scratch", "CrossQ, `crossq-scratch`", RED, ":"),
+)
+CELLS = {  # head of the column: task and disturbance
+    "∞, nominal": ("infinity", "nominal"),
+    "`slip`": ("infinity", "slip"),
+    "`start`": ("infinity", "start"),
+    "`ice`": ("infinity", "ice"),
+    "`combined-hard`": ("infinity", "combined-hard"),
+    "flower, nominal": ("flower", "nominal"),
+}
+
+Row = dict[str, Any]
+
+
+def drive(policy: str, task: str, disturbance: str, seeds: Sequence[int]) -> dict[str, Any]:
+    """Position RMS of the worst robot, mm, of every run, and the seeds of the runs that failed."""
+    scenario = load_scenario(task, disturbance=disturbance, horizon_s=HORIZON_S)
+    fitted = fit_policy(policy, scenario)
+    runs = [record.metrics() for record in run_seeds(fitted.scenario, fitted.policy, seeds)]
+    return {
+        "rms_mm": [round(max(robot.position_rmse_mm for robot in robots), 4) for robots in runs],
+        "failed": [seed for seed, robots in zip(seeds, runs, strict=True) if failed(robots)],
+    }
+
+
+def judge(policy: str, runs: int) -> dict[str, dict[str, Any]]:
+    """The runs of a policy in all cells, on the first seeds of those for tables."""
+    seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + runs)
+    found = {}
+    for name, (task, disturbance) in CELLS.items():
+        print(f"  {name}", flush=True)
+        found[name] = drive(policy, task, disturbance, seeds)
+    return found
+
+
+def about_training(curve: Mapping[str, Any]) -> Row:
+    """Robot steps and minutes of a whole training, and its course: robot steps, score in mm, minutes.
+
+    The minutes are those of the processor, from the first evaluation on, so without the environments' making;
+    if the curve has none, those of the clock, and none within the course.
+    """
+    evaluations = curve["evaluations"]
+    times_s = curve.get("evaluated_at_s", [])
+    if len(times_s) == len(evaluations):
+        minutes = [round((time_s - times_s[0]) / 60, 3) for time_s in times_s]
+        total = minutes[-1]
+    else:
+        minutes = [None] * len(evaluations)
+        total = round(curve["wall_time_s"] / 60, 3)
+    course = [
+        [one["robot_steps"], round(one["score_mm"], 4), at]
+        for one, at in zip(evaluations, minutes, strict=True)
+    ]
+    return {"robot_steps": evaluations[-1]["robot_steps"], "minutes": total, "course": course}
+
+
+def judged_anew(
+    kept: Sequence[Row], trained: Path, runs: int, judge: Callable[[str, int], Any] = judge
+) -> list[Row]:
+    """The rows of all entries, a row for each training seed; what was driven before is not driven again."""
+    before = {(row["name"], row["seed"]): row for row in kept}
+
+    def cells_of(row: Row | None, policy: str, digest: str) -> Any:
+        if row is not None and (row["digest"], row["runs"]) == (digest, runs):
+            return row["cells"]
+        print(policy, flush=True)
+        return judge(policy, runs)
+
+    old = before.get((DEFAULT, 0))
+    cells = cells_of(old, DEFAULT, DEFAULT)
+    rows = [{"name": DEFAULT, "seed": 0, "digest": DEFAULT, "runs": runs, "cells": cells}]
+    for entry in ENTRIES:
+        found = {}
+        for path in (trained / entry.name).glob(f"seed_*/{POLICY_FILE}"):
+            curve = json.loads((path.parent / CURVE_FILE).read_text("utf-8"))
+            digest = hashlib.sha256(path.read_bytes()).hexdigest()
+            row = before.get((entry.name, curve["seed"]))
+            found[curve["seed"]] = {
+                "name": entry.name,
+                "seed": curve["seed"],
+                "digest": digest,
+                "runs": runs,
+                "algorithm": json.loads((path.parent / CARD_FILE).read_text("utf-8"))["algorithm"],
+                **about_training(curve),
+                "cells": cells_of(row, str(path), digest),
+            }
+        for (name, seed), row in before.items():
+            if name == entry.name:
+                found.setdefault(seed, row)
+        rows += [found[seed] for seed in sorted(found)]
+    return rows
+
+
+def rows_of(rows: Sequence[Row], name: str) -> list[Row]:
+    """The rows of an entry, one for each training seed."""
+    return [row for row in rows if row["name"] == name]
+
+
+def held_mm(row: Row, cell: str) -> list[float]:
+    """Position RMS of the runs that did not fail, mm."""
+    lost = set(row["cells"][cell]["failed"])
+    return [
+        rms
+        for seed, rms in enumerate(row["cells"][cell]["rms_mm"], FIRST_TABLE_SEED)
+        if seed not in lost
+    ]
+
+
+def median_mm(rows: Sequence[Row], cell: str) -> float:
+    """Median over all rows' runs that did not fail, mm; not a number without any."""
+    held = [rms for row in rows for rms in held_mm(row, cell)]
+    return float(np.median(held)) if held else float("nan")
+
+
+def failures(rows: Sequence[Row], cells: Sequence[str] = tuple(CELLS)) -> int:
+    """How many runs of these cells failed."""
+    return sum(len(row["cells"][cell]["failed"]) for row in rows for cell in cells)
+
+
+def shown(rows: Sequence[Row], cell: str) -> str:
+    """Text of a cell: the median, the range of the training seeds' medians, the failed runs in brackets."""
+    lost = failures(rows, [cell])
+    if 2 * lost >= sum(row["runs"] for row in rows):
+        return f"({lost})"
+    text = f"{median_mm(rows, cell):.2f}"
+    if len(rows) > 1:
+        each = [median_mm([row], cell) for row in rows]
+        text += f" [{np.nanmin(each):.2f}–{np.nanmax(each):.2f}]"
+    return f"{text} ({lost})" if lost else text
+
+
+def judged_table(rows: Sequence[Row]) -> str:
+    """A row for each entry: robot steps and minutes of a training, every cell, and all failures."""
+    head = ["algorithm", "robot steps", "minutes", *CELLS, "failed, all"]
+    lines = []
+    for name, label in ((DEFAULT, f"no learning: `{DEFAULT}`"), *(one[:2] for one in ENTRIES)):
+        mine = rows_of(rows, name)
+        if not mine:
+            continue
+        spent = ["–", "–"]
+        if "course" in mine[0]:
+            steps = np.median([row["robot_steps"] for row in mine]) / MILLION
+            spent = [f"{steps:.2g} M", f"{np.median([row['minutes'] for row in mine]):.1f}"]
+        runs = sum(row["runs"] for row in mine) * len(CELLS)
+        all_failed = f"{failures(mine)} of {runs}"
+        lines.append([label, *spent, *(shown(mine, cell) for cell in CELLS), all_failed])
+    return table(head, lines)
+
+
+def draw(rows: Sequence[Row], path: Path) -> None:
+    """Draw the score against robot steps and against minutes: median and range of the training seeds."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(8.0, 3.4), layout="constrained")
+        left, right = figure.subplots(1, 2, sharey=True)
+        for entry in ENTRIES:
+            mine = rows_of(rows, entry.name)
+            if not mine:
+                continue
+            count = min(len(row["course"]) for row in mine)
+            course = np.array([row["course"][:count] for row in mine], dtype=np.float64)
+            steps, scores, minutes = np.moveaxis(course, 2, 0)
+            low, middle, high = scores.min(axis=0), np.median(scores, axis=0), scores.max(axis=0)
+            for panel, along in ((left, steps / MILLION), (right, minutes)):
+                if np.isnan(along).any():
+                    continue
+                x = np.median(along, axis=0)
+                label = f"{entry.label.replace('`', '')}, {len(mine)} seeds"
+                panel.plot(x, middle, entry.line, color=entry.colour, label=label, marker=".")
+                panel.fill_between(x, low, high, color=entry.colour, alpha=0.2, lw=0)
+        left.set(
+            xlabel="robot steps, millions", ylabel="score on validation seeds, mm", yscale="log"
+        )
+        right.set(xlabel="minutes of a core")
+        left.legend(fontsize="small")
+        figure.savefig(path, dpi=110)
+
+
+def main() -> None:
+    """Judge what is new, and write the table and the figure."""
+    parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
+    parser.add_argument("--trained", type=Path, default=TRAINED, help="folder of the trainings")
+    parser.add_argument("--runs", type=int, default=RUNS, help="of each cell and policy")
+    parser.add_argument("--kept", action="store_true", help="drive nothing")
+    given = parser.parse_args()
+    rows = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else []
+    if not given.kept:
+        rows = judged_anew(rows, given.trained, given.runs)
+        with atomic(RESULTS, encoding="utf-8") as file:
+            json.dump(rows, file, separators=(",", ":"))
+            file.write("\n")
+    put(PAGE, judged_table(rows), "algorithms")
+    draw(rows, PICTURE)
+
+
+if __name__ == "__main__":
+    main()
