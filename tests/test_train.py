@@ -227,6 +227,26 @@ class TestTraining:
         for name, tensor in theirs.items():
             assert mine[name].tobytes() == tensor.tobytes(), name
 
+    @pytest.mark.parametrize("algorithm", ["PPO", "SAC", "TQC", "CrossQ"])
+    def test_the_first_draws_have_the_deviation_of_the_configuration(self, algorithm):
+        import numpy as np
+        import torch
+
+        from baselines.training.model import make_envs, make_model
+
+        network = {"hidden": [16], "initial_log_std": -1.2, "action_gain": 0.01}
+        settings = ALGORITHMS[algorithm].get("settings", CONFIG["settings"])
+        config = load_config(
+            {**CONFIG, "algorithm": algorithm, "settings": settings, "network": network}
+        )
+        envs = make_envs(config, 1)
+        model = make_model(config, envs, 0)
+        torch.manual_seed(0)
+        drawn, _ = model.predict(np.tile(envs.reset(), (500, 1)), deterministic=False)
+        before_the_tanh = drawn if algorithm == "PPO" else np.arctanh(drawn)
+        np.testing.assert_allclose(before_the_tanh.mean(axis=0), 0.0, atol=0.03)
+        np.testing.assert_allclose(np.log(before_the_tanh.std(axis=0)), -1.2, atol=0.03)
+
     def test_a_killed_training_continues_from_its_last_checkpoint(self, tmp_path):
         from baselines.training.train import POLICY_FILE, train
 
