@@ -2,15 +2,15 @@
 
 First train, for example ``tlf train scratch --seeds 0,1,2``; then ``python docs/figures/make_algorithms.py``.
 It needs the extra ``figures``. Every policy of :data:`ENTRIES` that is found in ``results/train`` drives
-:data:`CELLS` on seeds that nothing was tuned on; what is found is kept in ``docs/learning/algorithms.json``
-by the digest of the policy's file, so that a policy is driven only once. An entry that was trained on another
-machine keeps its rows, and one without any training is left out. Table and figure are made from that file
-alone (``--kept``).
+:data:`CELLS` on seeds that nothing was tuned on. What is found is kept in ``docs/learning/algorithms.json``
+by the digest of the policy's file, so that a policy is driven only once; with more ``--runs`` only the others
+are driven. An entry that was trained on another machine keeps its rows, and one without any training is left
+out. Table and figure are made from that file alone (``--kept``).
 
 To add an algorithm: a folder ``results/train/NAME/seed_N`` with ``policy.safetensors``, its card and
-``curve.json`` for each training seed, and a line in :data:`ENTRIES`. Of the curve these are read:
-``evaluations`` with ``robot_steps`` and ``score_mm``, ``wall_time_s``, and, if they are there,
-``processor_time_s`` and ``evaluated_at_s`` (:class:`baselines.training.curve.TrainingProgress`).
+``curve.json`` for each training seed, and a line in :data:`ENTRIES`. Of the curve these are read: ``seed``;
+``evaluations`` with ``robot_steps``, ``score_mm`` and ``failed``; ``wall_time_s``, or, if it is there,
+``evaluated_at_s`` (:class:`baselines.training.curve.TrainingProgress`).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from typing import Any, NamedTuple
 import matplotlib
 import numpy as np
 from make_board import DOCS
-from make_figures import BLUE, GREEN, GREY, ORANGE, RED, STYLE
+from make_figures import BLUE, GREY, ORANGE, STYLE
 from make_parts import put
 from make_speed import table
 from matplotlib.figure import Figure
@@ -62,8 +62,6 @@ class Entry(NamedTuple):
 ENTRIES = (
     Entry("scratch", "PPO, `scratch`", BLUE, "-"),
     Entry("sac-scratch", "SAC, `sac-scratch`", ORANGE, "--"),
-    Entry("tqc-scratch", "TQC, `tqc-scratch`", GREEN, "-."),
-    Entry("crossq-scratch", "CrossQ, `crossq-scratch`", RED, ":"),
 )
 CELLS = {  # head of the column: task and disturbance
     "∞, nominal": ("infinity", "nominal"),
@@ -88,18 +86,17 @@ def drive(policy: str, task: str, disturbance: str, seeds: Sequence[int]) -> dic
     }
 
 
-def judge(policy: str, runs: int) -> dict[str, dict[str, Any]]:
-    """The runs of a policy in all cells, on the first seeds of those for tables."""
-    seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + runs)
+def judge(policy: str, seeds: range) -> dict[str, dict[str, Any]]:
+    """The runs of a policy in all cells with some seeds."""
     found = {}
     for name, (task, disturbance) in CELLS.items():
-        print(f"  {name}", flush=True)
+        print(f"  {name}, seeds {seeds.start} to {seeds.stop - 1}", flush=True)
         found[name] = drive(policy, task, disturbance, seeds)
     return found
 
 
 def about_training(curve: Mapping[str, Any]) -> Row:
-    """Robot steps and minutes of a whole training, and its course: robot steps, score in mm, minutes.
+    """Robot steps and minutes of a whole training, and its course: robot steps, score in mm, failed, minutes.
 
     The minutes are those of the processor, from the first evaluation on, so without the environments' making;
     if the curve has none, those of the clock, and none within the course.
@@ -113,45 +110,55 @@ def about_training(curve: Mapping[str, Any]) -> Row:
         minutes = [None] * len(evaluations)
         total = round(curve["wall_time_s"] / 60, 3)
     course = [
-        [one["robot_steps"], round(one["score_mm"], 4), at]
+        [one["robot_steps"], round(one["score_mm"], 4), one["failed"], at]
         for one, at in zip(evaluations, minutes, strict=True)
     ]
     return {"robot_steps": evaluations[-1]["robot_steps"], "minutes": total, "course": course}
 
 
 def judged_anew(
-    kept: Sequence[Row], trained: Path, runs: int, judge: Callable[[str, int], Any] = judge
+    kept: Sequence[Row],
+    trained: Path,
+    runs: int,
+    judge: Callable[[str, range], dict[str, dict[str, Any]]] = judge,
 ) -> list[Row]:
-    """The rows of all entries, a row for each training seed; what was driven before is not driven again."""
+    """The rows of all entries, a row for each training seed; what was driven before is not driven again.
+
+    A policy with fewer runs than asked for drives the others; its runs do not depend on one another.
+    """
     before = {(row["name"], row["seed"]): row for row in kept}
 
-    def cells_of(row: Row | None, policy: str, digest: str) -> Any:
-        if row is not None and (row["digest"], row["runs"]) == (digest, runs):
-            return row["cells"]
-        print(policy, flush=True)
-        return judge(policy, runs)
+    def judged(name: str, seed: int, policy: str, digest: str) -> Row:
+        old = before.get((name, seed))
+        cells: dict[str, dict[str, Any]] = {cell: {"rms_mm": [], "failed": []} for cell in CELLS}
+        done = 0
+        if old is not None and old["digest"] == digest:
+            cells, done = old["cells"], old["runs"]
+        if done < runs:
+            print(policy, flush=True)
+            more = judge(policy, range(FIRST_TABLE_SEED + done, FIRST_TABLE_SEED + runs))
+            cells = {
+                cell: {what: cells[cell][what] + more[cell][what] for what in cells[cell]}
+                for cell in CELLS
+            }
+        return {
+            "name": name,
+            "seed": seed,
+            "digest": digest,
+            "runs": max(done, runs),
+            "cells": cells,
+        }
 
-    old = before.get((DEFAULT, 0))
-    cells = cells_of(old, DEFAULT, DEFAULT)
-    rows = [{"name": DEFAULT, "seed": 0, "digest": DEFAULT, "runs": runs, "cells": cells}]
+    rows = [judged(DEFAULT, 0, DEFAULT, DEFAULT)]
     for entry in ENTRIES:
-        found = {}
+        found = {seed: row for (name, seed), row in before.items() if name == entry.name}
         for path in (trained / entry.name).glob(f"seed_*/{POLICY_FILE}"):
             curve = json.loads((path.parent / CURVE_FILE).read_text("utf-8"))
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
-            row = before.get((entry.name, curve["seed"]))
-            found[curve["seed"]] = {
-                "name": entry.name,
-                "seed": curve["seed"],
-                "digest": digest,
-                "runs": runs,
-                "algorithm": json.loads((path.parent / CARD_FILE).read_text("utf-8"))["algorithm"],
-                **about_training(curve),
-                "cells": cells_of(row, str(path), digest),
-            }
-        for (name, seed), row in before.items():
-            if name == entry.name:
-                found.setdefault(seed, row)
+            card = json.loads((path.parent / CARD_FILE).read_text("utf-8"))
+            about = {"algorithm": card["algorithm"], **about_training(curve)}
+            seed = curve["seed"]
+            found[seed] = judged(entry.name, seed, str(path), digest) | about
         rows += [found[seed] for seed in sorted(found)]
     return rows
 
@@ -196,16 +203,20 @@ def shown(rows: Sequence[Row], cell: str) -> str:
 
 def judged_table(rows: Sequence[Row]) -> str:
     """A row for each entry: robot steps and minutes of a training, every cell, and all failures."""
-    head = ["algorithm", "robot steps", "minutes", *CELLS, "failed, all"]
+    head = ["algorithm", "seeds", "robot steps", "minutes", *CELLS, "failed, all"]
     lines = []
     for name, label in ((DEFAULT, f"no learning: `{DEFAULT}`"), *(one[:2] for one in ENTRIES)):
         mine = rows_of(rows, name)
         if not mine:
             continue
-        spent = ["–", "–"]
+        spent = ["–", "–", "–"]
         if "course" in mine[0]:
             steps = np.median([row["robot_steps"] for row in mine]) / MILLION
-            spent = [f"{steps:.2g} M", f"{np.median([row['minutes'] for row in mine]):.1f}"]
+            spent = [
+                str(len(mine)),
+                f"{steps:.2g} M",
+                f"{np.median([row['minutes'] for row in mine]):.1f}",
+            ]
         runs = sum(row["runs"] for row in mine) * len(CELLS)
         all_failed = f"{failures(mine)} of {runs}"
         lines.append([label, *spent, *(shown(mine, cell) for cell in CELLS), all_failed])
@@ -223,13 +234,13 @@ def draw(rows: Sequence[Row], path: Path) -> None:
                 continue
             count = min(len(row["course"]) for row in mine)
             course = np.array([row["course"][:count] for row in mine], dtype=np.float64)
-            steps, scores, minutes = np.moveaxis(course, 2, 0)
+            steps, scores, _, minutes = np.moveaxis(course, 2, 0)
             low, middle, high = scores.min(axis=0), np.median(scores, axis=0), scores.max(axis=0)
             for panel, along in ((left, steps / MILLION), (right, minutes)):
                 if np.isnan(along).any():
                     continue
                 x = np.median(along, axis=0)
-                label = f"{entry.label.replace('`', '')}, {len(mine)} seeds"
+                label = f"{entry.label.replace('`', '')}, {len(mine)} seed{'s' * (len(mine) > 1)}"
                 panel.plot(x, middle, entry.line, color=entry.colour, label=label, marker=".")
                 panel.fill_between(x, low, high, color=entry.colour, alpha=0.2, lw=0)
         left.set(
