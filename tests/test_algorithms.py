@@ -59,6 +59,7 @@ def test_only_what_is_new_is_driven(tmp_path):
     trained(tmp_path, "scratch", 0, b"a")
     trained(tmp_path, "scratch", 1, b"b")
     trained(tmp_path, "unknown", 0, b"c")
+    trained(tmp_path, "scratch", 2, b"unfinished", config={"robot_steps": 500_001})
     first = again([])
     assert [(row["name"], row["seed"]) for row in first] == [
         (algorithms.DEFAULT, 0),

@@ -116,6 +116,12 @@ def about_training(curve: Mapping[str, Any]) -> Row:
     return {"robot_steps": evaluations[-1]["robot_steps"], "minutes": total, "course": course}
 
 
+def finished(curve: Mapping[str, Any]) -> bool:
+    """Whether a training has come to the robot steps of its configuration, if it has one."""
+    wanted = curve.get("config", {}).get("robot_steps", 0)
+    return bool(curve["evaluations"][-1]["robot_steps"] >= wanted)
+
+
 def judged_anew(
     kept: Sequence[Row],
     trained: Path,
@@ -154,6 +160,9 @@ def judged_anew(
         found = {seed: row for (name, seed), row in before.items() if name == entry.name}
         for path in (trained / entry.name).glob(f"seed_*/{POLICY_FILE}"):
             curve = json.loads((path.parent / CURVE_FILE).read_text("utf-8"))
+            if not finished(curve):
+                print(f"{path.parent}: the training is not finished, and is left out", flush=True)
+                continue
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             card = json.loads((path.parent / CARD_FILE).read_text("utf-8"))
             about = {"algorithm": card["algorithm"], **about_training(curve)}
