@@ -154,25 +154,30 @@ def test_robot_steps_until_the_robots_are_held():
     scores = [f"{row['course'][-2][1]:.1f}" for row in SAC]
     assert {row["course"][-2][0] for row in SAC} == {202_752}
     assert f"after 0.20 M the three seeds have {scores[0]}, {scores[1]} and {scores[2]} mm" in TEXT
-    steps, score, *_ = PPO[0]["course"][1]
-    assert f"PPO has {score:.1f} mm at its first evaluation, after {steps / 1e6:.2f} M" in TEXT
+    first = [row["course"][1] for row in PPO]
+    scores = " and ".join(f"{score:.1f}" for _, score, *_ in first)
+    steps = first[0][0] / 1e6
+    assert f"PPO has {scores} mm at its first evaluation, after {steps:.2f} M" in TEXT
 
 
 def test_minutes():
     minutes = sorted(row["minutes"] for row in SAC)[1]
     assert f"A training of SAC takes {minutes:.1f} minutes for an eighth of the robot" in TEXT
     assert 7 < PPO[0]["robot_steps"] / SAC[0]["robot_steps"] < 9
-    _, score, _, after = PPO[0]["course"][2]
-    assert f"After {after:.1f} minutes PPO has {score:.1f} mm" in TEXT
-    assert after < minutes
+    for row in PPO:
+        _, score, _, after = row["course"][2]
+        assert after < 1.55 < minutes
+        assert score == pytest.approx(1.0, abs=0.2)
+    assert "After 1.5 minutes PPO has about 1 mm" in TEXT
 
 
 def test_ppo_is_more_precise():
     default = algorithms.rows_of(ROWS, algorithms.DEFAULT)
     for cell in algorithms.CELLS:
         ppo, sac, base = (algorithms.median_mm(rows, cell) for rows in (PPO, SAC, default))
-        assert ppo < min(0.5 * sac, base)
+        assert ppo < 0.5 * sac
         assert sac > base
+        assert (ppo < base) == (cell != "`slip`")
 
 
 def test_a_training_that_broke_keeps_its_best_policy():
