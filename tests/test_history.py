@@ -243,7 +243,7 @@ class TestTraining:
             envs.step(np.full((envs.num_envs, 2), np.nan))
         np.testing.assert_array_equal(found, envs.observations())
 
-    @pytest.mark.parametrize("algorithm", ["PPO", "SAC"])
+    @pytest.mark.parametrize("algorithm", ["PPO", "SAC", "CrossQ"])
     def test_an_interrupted_training_continues_to_the_same_policy(self, algorithm, tmp_path):
         from baselines.training.train import CHECKPOINT_FILE, POLICY_FILE, train
 

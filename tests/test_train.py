@@ -37,13 +37,18 @@ CONFIG = {
         "horizon_s": 2.0,
     },
 }
+WITH_A_BUFFER = {
+    "robot_steps": 2400,
+    "checkpoint_every": 768,
+    "settings": {"buffer_size": 2000, "learning_starts": 100, "batch_size": 32},
+}
 ALGORITHMS = {
     "PPO": {},
-    "SAC": {
+    **{name: {"algorithm": name, **WITH_A_BUFFER} for name in ("SAC", "TQC", "CrossQ")},
+    "SAC with a fixed entropy coefficient": {
         "algorithm": "SAC",
-        "robot_steps": 2400,
-        "checkpoint_every": 768,
-        "settings": {"buffer_size": 2000, "learning_starts": 100, "batch_size": 32},
+        **WITH_A_BUFFER,
+        "settings": {**WITH_A_BUFFER["settings"], "ent_coef": 0.01, "n_steps": 3},
     },
     "PPO with a curriculum": {
         "curriculum": {"failed_share": 0.9},
@@ -70,7 +75,7 @@ def test_shipped_configs_are_valid(path: Path):
     [
         (
             {"algorithm": "A2C"},
-            "algorithm: Input should be 'PPO', 'SAC', 'RecurrentPPO' or 'TD3BC'",
+            "algorithm: Input should be 'PPO', 'SAC', 'TQC', 'CrossQ', 'RecurrentPPO' or 'TD3BC'",
         ),
         ({"robot_steps": 0}, "robot_steps: Input should be greater than or equal to 1, got 0"),
         ({"rollouts": 3}, "rollouts: unknown key"),
@@ -208,7 +213,12 @@ class TestTraining:
             assert (parts / CHECKPOINT_FILE).exists()
         again = train(config, 3, parts)
         for curve in (whole, again):
-            del curve["wall_time_s"]
+            times_s = curve.pop("evaluated_at_s")
+            assert len(times_s) == len(curve["evaluations"])
+            assert times_s == sorted(times_s)
+            assert times_s[0] > 0
+            assert times_s[-1] <= curve.pop("processor_time_s")
+            assert curve.pop("wall_time_s") > 0
         assert whole == again
         assert len(whole["evaluations"]) >= 3
         assert (parts / POLICY_FILE).read_bytes() == (tmp_path / "whole" / POLICY_FILE).read_bytes()
@@ -216,6 +226,26 @@ class TestTraining:
         assert mine.keys() == theirs.keys()
         for name, tensor in theirs.items():
             assert mine[name].tobytes() == tensor.tobytes(), name
+
+    @pytest.mark.parametrize("algorithm", ["PPO", "SAC", "TQC", "CrossQ"])
+    def test_the_first_draws_have_the_deviation_of_the_configuration(self, algorithm):
+        import numpy as np
+        import torch
+
+        from baselines.training.model import make_envs, make_model
+
+        network = {"hidden": [16], "initial_log_std": -1.2, "action_gain": 0.01}
+        settings = ALGORITHMS[algorithm].get("settings", CONFIG["settings"])
+        config = load_config(
+            {**CONFIG, "algorithm": algorithm, "settings": settings, "network": network}
+        )
+        envs = make_envs(config, 1)
+        model = make_model(config, envs, 0)
+        torch.manual_seed(0)
+        drawn, _ = model.predict(np.tile(envs.reset(), (500, 1)), deterministic=False)
+        before_the_tanh = drawn if algorithm == "PPO" else np.arctanh(drawn)
+        np.testing.assert_allclose(before_the_tanh.mean(axis=0), 0.0, atol=0.03)
+        np.testing.assert_allclose(np.log(before_the_tanh.std(axis=0)), -1.2, atol=0.03)
 
     def test_a_killed_training_continues_from_its_last_checkpoint(self, tmp_path):
         from baselines.training.train import POLICY_FILE, train

@@ -6,7 +6,7 @@ import itertools
 import re
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated, Any, Literal, Self
+from typing import Annotated, Any, Literal, Self, get_args
 
 from pydantic import Field, ValidationError, model_validator
 
@@ -27,6 +27,8 @@ SeedsFromTo = tuple[
     Annotated[Whole, Field(ge=0)], Annotated[Whole, Field(ge=0)]
 ]  # first, end (not run)
 
+AlgorithmName = Literal["PPO", "SAC", "TQC", "CrossQ", "RecurrentPPO", "TD3BC"]
+ALGORITHMS: tuple[str, ...] = get_args(AlgorithmName)
 
 # Fields of a training's scenario that are the task; all others are the learner's.
 OF_THE_TASK = (
@@ -49,11 +51,11 @@ class NetworkConfig(Frozen):
 
     hidden: Annotated[tuple[Count, ...], Field(max_length=4)] = (64, 64)
     activation: Literal["tanh", "relu"] = "tanh"
-    history: History | None = None  # earlier observations that it sees; PPO and SAC
+    history: History | None = None  # earlier observations that it sees; not RecurrentPPO
     # A fixed first layer for raw sensors (baselines/training/sensor_layer.py); the critic sees the truth.
     input: Literal["sensor"] | None = None
     lstm: Count | None = None  # size of the LSTM's state; RecurrentPPO only
-    initial_log_std: Number = -1.6
+    initial_log_std: Number = -1.6  # of the draws of actions; SAC, TQC and CrossQ: before the tanh
     action_gain: Positive = 0.1  # factor on the initial weights of the action: begin near 0
 
 
@@ -173,7 +175,7 @@ class SearchConfig(Frozen):
 class TrainConfig(Frozen):
     """A training: the algorithm, the episodes and the evaluation. Times in s."""
 
-    algorithm: Literal["PPO", "SAC", "RecurrentPPO", "TD3BC"]
+    algorithm: AlgorithmName
     settings: dict[str, Any] = {}  # keyword arguments of SB3's algorithm
     final_learning_rate_share: Annotated[Number, Field(gt=0, le=1)] = 1.0  # falls linearly
     network: NetworkConfig = NetworkConfig()

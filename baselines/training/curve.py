@@ -20,6 +20,10 @@ class TrainingProgress:
     """Time, rollouts and evaluations of a training so far; part of every checkpoint."""
 
     wall_time_s: float = 0.0
+    processor_time_s: float = 0.0  # of all threads; other work on the machine does not count
+    evaluated_at_s: list[float] = field(
+        default_factory=list
+    )  # processor time after each evaluation
     rollouts: list[dict[str, float]] = field(default_factory=list)
     evaluations: list[dict[str, Any]] = field(default_factory=list)
     level_count: int = 1  # levels of the curriculum reached so far, the first of them included

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
@@ -13,6 +14,7 @@ from baselines.policies.card import WEIGHTS, Card, write_policy
 from baselines.policies.learned import LearnedPolicy, load_policy
 from baselines.policies.network import Head, Network
 from baselines.runs.provenance import installed_versions, versions
+from baselines.training.config import ALGORITHMS
 from baselines.training.history import ModelPolicy, history_of
 from baselines.training.sensor_policy import SensorPolicy
 from tlf_env.task.actions import ACTION_SIZE
@@ -23,12 +25,8 @@ if TYPE_CHECKING:
     from stable_baselines3.common.base_class import BaseAlgorithm
 
 TRAINERS = ("torch", "stable-baselines3", "sb3-contrib")
-ALGORITHMS = ("PPO", "SAC", "RecurrentPPO", "TD3", "TD3BC")
-HEADS: dict[str, Head] = {
-    "SAC": "squashed_gaussian",
-    "TD3": "tanh",
-    "TD3BC": "tanh",
-}  # of the others: gaussian
+NORMALISING = "BatchRenorm1d"  # the layer of CrossQ before each dense one
+EXPORTABLE = (*ALGORITHMS, "TD3")
 AGREEMENT = 1e-5  # largest difference between an action of the model and of its copy
 CHECKED_ROWS, CHECKED_STEPS = 32, 4
 
@@ -51,10 +49,11 @@ def export_policy(
     Parameters
     ----------
     model
-        SB3's PPO, SAC or TD3, :class:`~baselines.training.offline.TD3BC`, or sb3-contrib's
+        SB3's PPO, SAC or TD3, :class:`~baselines.training.offline.TD3BC`, or sb3-contrib's TQC, CrossQ or
         RecurrentPPO with an ``MlpPolicy`` (``MlpLstmPolicy``, one layer): tanh or ReLU, no gSDE, actions
         in [−1, 1]². The statistics of a ``VecNormalize`` that normalises observations are exported, too,
-        and the history of a :class:`~baselines.training.history.HistoryVecEnv`.
+        and the history of a :class:`~baselines.training.history.HistoryVecEnv`. CrossQ's normalisation
+        within the network becomes part of the layers behind it.
     path
         Ends in ``.safetensors``.
     scenario
@@ -77,8 +76,8 @@ def export_policy(
     if path.suffix.lower() != WEIGHTS:
         raise ValueError(f"{path}: the name of a policy must end in {WEIGHTS}")
     algorithm = type(model).__name__
-    if algorithm not in ALGORITHMS:
-        raise ValueError(f"a {algorithm} model cannot be exported; {', '.join(ALGORITHMS)} can")
+    if algorithm not in EXPORTABLE:
+        raise ValueError(f"a {algorithm} model cannot be exported; {', '.join(EXPORTABLE)} can")
     network, tensors = _network_of(model)
     card: dict[str, Any] = {
         "algorithm": algorithm,
@@ -102,16 +101,10 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
         raise ValueError(f"the model's actions must be a Box of [−1, 1]², got {box}")
     if getattr(model, "use_sde", False):
         raise ValueError("a model with gSDE cannot be exported")
-    if type(model).__name__ == "SAC":
-        actor = model.policy.actor
-        hidden, mean = actor.latent_pi, actor.mu
-        tensors = _dense("log_std", actor.log_std)
-    elif HEADS.get(type(model).__name__) == "tanh":
-        *hidden, mean, _ = model.policy.actor.mu
-        tensors = {}
-    else:
-        hidden, mean = model.policy.mlp_extractor.policy_net, model.policy.action_net
-        tensors = {"log_std": _array(model.policy.log_std)}
+    actor = actor_of(model)
+    tensors: dict[str, np.ndarray] = {}
+    if actor.head == "gaussian":
+        tensors["log_std"] = _array(actor.log_std)
     lstm = getattr(model.policy, "lstm_actor", None)
     if lstm is not None:
         if lstm.num_layers != 1:
@@ -120,21 +113,13 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
             )
         for name in ("weight_ih", "weight_hh", "bias_ih", "bias_hh"):
             tensors[f"lstm.{name}"] = _array(getattr(lstm, f"{name}_l0"))
-    layers, activations = list(hidden)[::2], {type(one).__name__ for one in list(hidden)[1::2]}
-    plain = model.policy.plain_layers() if isinstance(model.policy, SensorPolicy) else None
+    chain = [one for one in actor.hidden if type(one).__name__ != NORMALISING]
+    layers, activations = chain[::2], {type(one).__name__ for one in chain[1::2]}
     linear = all(type(layer).__name__ == "Linear" for layer in layers)
-    if not linear or len(hidden) % 2 or activations not in (set(), {"Tanh"}, {"ReLU"}):
-        raise ValueError(
-            f"hidden layers must be linear with tanh or with ReLU, got {' '.join(str(hidden).split())}"
-        )
-    if plain is not None:
-        *inner, last = plain
-        for name, dense in [*((f"hidden.{i}", one) for i, one in enumerate(inner)), ("mean", last)]:
-            tensors |= {f"{name}.weight": dense.weight, f"{name}.bias": dense.bias}
-    else:
-        for i, layer in enumerate(layers):
-            tensors |= _dense(f"hidden.{i}", layer)
-        tensors |= _dense("mean", mean)
+    if not linear or len(chain) % 2 or activations not in (set(), {"Tanh"}, {"ReLU"}):
+        hidden = " ".join(str(one) for one in actor.hidden)
+        raise ValueError(f"hidden layers must be linear with tanh or with ReLU, got {hidden}")
+    tensors |= _plain(model.policy) if isinstance(model.policy, SensorPolicy) else _folded(actor)
     history = history_of(model)
     if history is not None and lstm is not None:
         raise ValueError("a model with an LSTM and a history cannot be exported")
@@ -149,19 +134,80 @@ def _network_of(model: BaseAlgorithm) -> tuple[Network, dict[str, np.ndarray]]:
         }
     network = Network(
         hidden=tuple(
-            len(tensors[f"hidden.{i}.bias"]) for i in range(len(plain[:-1] if plain else layers))
+            len(tensors[name]) for name in tensors if re.match(r"hidden\.\d+\.bias", name)
         ),
         activation="relu" if "ReLU" in activations else "tanh",
         history=history,
         lstm=None if lstm is None else lstm.hidden_size,
-        head=HEADS.get(type(model).__name__, "gaussian"),
+        head=actor.head,
         normalised=normalised,
     )
     return network, tensors
 
 
-def _dense(name: str, layer: Any) -> dict[str, np.ndarray]:
-    return {f"{name}.weight": _array(layer.weight), f"{name}.bias": _array(layer.bias)}
+class Actor(NamedTuple):
+    """What acts in a model: its hidden layers and activations, and the layers behind them."""
+
+    hidden: list[Any]
+    mean: Any  # the last layer, before a tanh
+    log_std: Any  # numbers, or a layer beside the last one; None if nothing is drawn
+    head: Head
+
+
+def actor_of(model: Any) -> Actor:
+    """The actor of a model of SB3 or sb3-contrib."""
+    policy = model.policy
+    actor = getattr(policy, "actor", None)
+    if actor is None:
+        hidden = list(policy.mlp_extractor.policy_net)
+        return Actor(hidden, policy.action_net, policy.log_std, "gaussian")
+    if hasattr(actor, "log_std"):
+        return Actor(list(actor.latent_pi), actor.mu, actor.log_std, "squashed_gaussian")
+    *hidden, mean, _ = actor.mu
+    return Actor(hidden, mean, None, "tanh")
+
+
+def _plain(policy: SensorPolicy) -> dict[str, np.ndarray]:
+    """Tensors of a sensor policy as plain layers."""
+    *inner, last = policy.plain_layers()
+    named = {f"hidden.{i}": one for i, one in enumerate(inner)} | {"mean": last}
+    return {
+        f"{name}.{part}": getattr(layer, part)
+        for name, layer in named.items()
+        for part in ("weight", "bias")
+    }
+
+
+def _folded(actor: Actor) -> dict[str, np.ndarray]:
+    """Tensors of the hidden layers and the heads, with the normalisation before each of them in it.
+
+    Once a network is trained, its normalisation is y = a·x + b for each unit, so that W·y + c is
+    (W·a)·x + (W·b + c): one layer.
+    """
+    tensors: dict[str, np.ndarray] = {}
+    scale: Any = 1.0
+    shift: Any = 0.0
+
+    def keep(name: str, layer: Any) -> None:
+        weight = _array(layer.weight).astype(np.float64)
+        bias = _array(layer.bias) + weight @ np.broadcast_to(shift, weight.shape[1])
+        tensors[f"{name}.weight"] = (weight * scale).astype(np.float32)
+        tensors[f"{name}.bias"] = bias.astype(np.float32)
+
+    layers = 0
+    for one in actor.hidden:
+        kind = type(one).__name__
+        if kind == NORMALISING:
+            mean, var = (_array(part).astype(np.float64) for part in (one.ra_mean, one.ra_var))
+            scale = _array(one.scale) / np.sqrt(var + one.eps)
+            shift = _array(one.bias) - scale * mean
+        elif kind == "Linear":
+            keep(f"hidden.{layers}", one)
+            layers, scale, shift = layers + 1, 1.0, 0.0
+    keep("mean", actor.mean)
+    if actor.head == "squashed_gaussian":
+        keep("log_std", actor.log_std)
+    return tensors
 
 
 def _array(tensor: Any) -> np.ndarray:

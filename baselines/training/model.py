@@ -13,6 +13,7 @@ from stable_baselines3.common.vec_env import VecEnv
 
 from baselines.sb3 import FormationVecEnv
 from baselines.training.config import TrainConfig
+from baselines.training.export import actor_of
 from baselines.training.history import HistoryVecEnv
 from baselines.training.offline import TD3BC, UPDATES_PER_CALL, read_data, standardised
 from baselines.training.sensor_policy import SensorPolicy, SensorVecEnv
@@ -62,16 +63,16 @@ def make_model(config: TrainConfig, envs: FormationVecEnv, seed: int) -> Any:
     policy: dict[str, Any] = {
         "net_arch": layers,
         "activation_fn": {"tanh": torch.nn.Tanh, "relu": torch.nn.ReLU}[network.activation],
-        "log_std_init": network.initial_log_std,
+        "log_std_init": network.initial_log_std,  # only PPO's has an effect
     }
+    if config.algorithm == "TD3BC":
+        del policy["log_std_init"]  # it draws nothing
     kind: Any
     make, kind = algorithm(config)
     if isinstance(envs, SensorVecEnv):
         kind, policy["layer"] = SensorPolicy, envs.layer
     if network.lstm is not None:
         policy |= {"lstm_hidden_size": network.lstm}
-    if config.algorithm in ("SAC", "TD3BC"):
-        del policy["log_std_init"]  # SAC computes it by a head, TD3BC draws nothing
     known = set(inspect.signature(make).parameters) - {"policy", "env", "seed", "data", "alpha"}
     for name in config.settings:
         if name not in known:
@@ -86,13 +87,13 @@ def make_model(config: TrainConfig, envs: FormationVecEnv, seed: int) -> Any:
         model = make(kind, seen, policy_kwargs=policy, seed=seed, device="cpu", **given)
     except (TypeError, AssertionError) as error:
         raise ValueError(f"settings: {config.algorithm} refuses them: {error}") from error
-    if config.algorithm == "TD3BC":
-        head = model.actor.mu[-2]  # before the tanh
-    else:
-        head = model.actor.mu if config.algorithm == "SAC" else model.policy.action_net
+    actor = actor_of(model)
     with torch.no_grad():
-        head.weight.mul_(network.action_gain)
-        head.bias.mul_(network.action_gain)
+        actor.mean.weight.mul_(network.action_gain)
+        actor.mean.bias.mul_(network.action_gain)
+        if actor.head == "squashed_gaussian":  # its deviation is the output of a layer, too
+            actor.log_std.weight.mul_(network.action_gain)
+            actor.log_std.bias.fill_(network.initial_log_std)
     if isinstance(model.policy, SensorPolicy):
         model.policy.begin_at_reference()
     if config.algorithm == "TD3BC":
@@ -108,13 +109,15 @@ def algorithm(config: TrainConfig) -> tuple[Callable[..., Any], str]:
     ValueError
         if its package is missing.
     """
-    if config.algorithm != "RecurrentPPO":
-        return {"PPO": PPO, "SAC": SAC, "TD3BC": TD3BC}[config.algorithm], "MlpPolicy"
+    name = config.algorithm
+    own: dict[str, Callable[..., Any]] = {"PPO": PPO, "SAC": SAC, "TD3BC": TD3BC}
+    if name in own:
+        return own[name], "MlpPolicy"
     try:
-        from sb3_contrib import RecurrentPPO
+        import sb3_contrib
     except ModuleNotFoundError as error:
-        raise ValueError(f"RecurrentPPO needs sb3-contrib ({install_command('train')})") from error
-    return RecurrentPPO, "MlpLstmPolicy"
+        raise ValueError(f"{name} needs sb3-contrib ({install_command('train')})") from error
+    return getattr(sb3_contrib, name), "MlpLstmPolicy" if name == "RecurrentPPO" else "MlpPolicy"
 
 
 def spread_out(model: Any, envs: FormationVecEnv, first_seed: int) -> None:

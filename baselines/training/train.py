@@ -108,15 +108,18 @@ def _train(
 ) -> dict[str, Any]:
     def evaluate() -> None:
         evaluate_and_keep(model, config, seed, folder, done, command)
+        done.evaluated_at_s.append(time.process_time() - began_processor)
         if evaluated is not None:
             evaluated(done.evaluations[-1])
 
-    started = time.perf_counter()
+    began, began_processor = time.perf_counter(), time.process_time()
     envs = make_envs(config, threads)
     model = make_model(config, envs, seed)
     model.set_logger(Logger(str(folder), tensorboard(folder)))
     if (folder / CHECKPOINT_FILE).exists():
         done = TrainingProgress(**read_checkpoint(folder / CHECKPOINT_FILE, model, envs))
+        began -= done.wall_time_s
+        began_processor -= done.processor_time_s
         set_level(envs, config, done)
     else:
         done = TrainingProgress()
@@ -128,7 +131,6 @@ def _train(
                 model, envs, config
             )
         evaluate()
-    began = started - done.wall_time_s
     with interrupts() as stop:
         while model.num_timesteps < config.robot_steps:
             before = model.num_timesteps
@@ -140,6 +142,7 @@ def _train(
             if last or passed(config.evaluation.every, before, now):
                 evaluate()
             done.wall_time_s = time.perf_counter() - began
+            done.processor_time_s = time.process_time() - began_processor
             if progress is not None:
                 progress(min(now, config.robot_steps), config.robot_steps)
             stopping = bool(stop)
