@@ -155,7 +155,8 @@ def test_robot_steps_until_the_robots_are_held():
     assert {row["course"][-2][0] for row in SAC} == {202_752}
     assert f"after 0.20 M the three seeds have {scores[0]}, {scores[1]} and {scores[2]} mm" in TEXT
     first = [row["course"][1] for row in PPO]
-    scores = " and ".join(f"{score:.1f}" for _, score, *_ in first)
+    assert len(first) == 3
+    scores = "{:.1f}, {:.1f} and {:.1f}".format(*(score for _, score, *_ in first))
     steps = first[0][0] / 1e6
     assert f"PPO has {scores} mm at its first evaluation, after {steps:.2f} M" in TEXT
 
