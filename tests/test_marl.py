@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 import json
+import re
 from pathlib import Path
 
 import numpy as np
@@ -70,3 +71,20 @@ def test_the_figure_is_drawn(make_marl, kept, tmp_path):
     path = tmp_path / "marl.png"
     make_marl.draw(kept, path)
     assert path.read_bytes().startswith(b"\x89PNG")
+
+
+def test_the_page_says_what_the_runs_show(make_marl, kept):
+    of = {name: [one for one in kept if one["variant"] == name] for name in ("IPPO", "MAPPO")}
+    assert [len(runs) for runs in of.values()] == [5, 5]
+    failed = {name: sum(sum(one["nominal"]["failed"]) for one in runs) for name, runs in of.items()}
+    assert failed["IPPO"] == 0
+    assert f"{failed['MAPPO']} of 250 nominal runs fail" in section()
+    medians = {
+        name: [float(np.median(one["nominal"]["rms_mm"])) for one in runs]
+        for name, runs in of.items()
+    }
+    middle, low, _ = re.findall(r"[\d.e+]+", make_marl.ratio(medians["MAPPO"], medians["IPPO"]))
+    assert f"The ratio of the errors is {float(middle):.0f}," in section()
+    assert float(low) > 1
+    assert max(medians["IPPO"]) / min(medians["IPPO"]) == pytest.approx(20, rel=0.1)
+    assert min(sum(sum(one["slip"]["failed"]) for one in runs) for runs in of.values()) > 0

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+import importlib
+import json
 import re
 import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,6 +30,7 @@ from tlf_env.task.actions import FULL_WHEEL_SPEED_RAD_S
 from tlf_env.task.observation import SENSOR_TAIL_ENTRIES, sensor_entries
 from tlf_env.task.scenario import load_scenario
 
+DOCS = Path(__file__).resolve().parents[1] / "docs"
 KEPT = (
     *(f"{name}_{k}" for k in (9, 19) for name in ("fix_x", "fix_y", "step_l", "step_r")),
     "message_x",
@@ -173,6 +177,28 @@ def test_a_wrong_config_is_reported_in_one_line(changes: dict, said: str):
     with pytest.raises(ValueError, match=re.escape(said)) as error:
         load_config({**TRAINING, **changes})
     assert "\n" not in str(error.value)
+
+
+def test_the_page_has_what_was_measured(monkeypatch):
+    """The table, and that no nominal run fails with any of three training seeds."""
+    monkeypatch.syspath_prepend(str(DOCS / "figures"))
+    make_sensors = importlib.import_module("make_sensors")
+    kept = json.loads((DOCS / "learning" / "sensors.json").read_text("utf-8"))
+    section = (DOCS / "learning.md").read_text("utf-8").split("## Raw sensors")[1].split("\n## ")[0]
+    assert make_sensors.judged_table(kept) in section
+    trained = [one for name, one in kept.items() if name.startswith("seed_")]
+    assert len(trained) == 3
+    lost = {
+        head: sum(len(one["cells"][head]["failed"]) for one in trained)
+        for head in trained[0]["cells"]
+    }
+    assert lost["∞, nominal"] == lost["flower, nominal"] == 0
+    assert {one["cells"]["∞, nominal"]["runs"] for one in trained} == {100}
+    assert f"{lost['`slip`']} of 90 runs under `slip`" in section
+    training = [one["training"] for name, one in sorted(kept.items()) if name.startswith("seed_")]
+    assert all(one["kept_at"] == 0 for one in training)  # PPO added nothing
+    for name in ("imitated_mm", "ended_mm"):
+        assert "{:.1f}, {:.1f} and {:.1f}".format(*(one[name] for one in training)) in section
 
 
 class TestWithTorch:

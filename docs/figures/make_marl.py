@@ -48,6 +48,10 @@ STYLES = {
 }
 
 
+def no_state(env: Any) -> None:
+    """The specification of a task without state; BenchMARL pickles it, so that it needs a name."""
+
+
 def experiment(variant: str, seed: int) -> Any:
     """A training of BenchMARL on its shipped task ``infinity``."""
     import torch
@@ -61,7 +65,7 @@ def experiment(variant: str, seed: int) -> Any:
     name, shared, true_state = VARIANTS[variant]
     task = FormationTask.INFINITY.get_from_yaml()
     if not true_state:
-        task.state_spec = lambda env: None
+        task.state_spec = no_state
     task.config.update(horizon_s=66.0, infos=())
     config = ExperimentConfig.get_from_yaml()
     config.loggers, config.render, config.evaluation = [], False, False
@@ -105,7 +109,7 @@ def trained(variant: str, seed: int) -> dict[str, Any]:
     return {
         "variant": variant,
         "seed": seed,
-        "returns": returns,
+        "returns": [value if np.isfinite(value) else None for value in returns],
         "minutes": minutes,
         "digest": simulation_digest(),
         **{name: judged(made.policy, name) for name in CELLS},
@@ -234,14 +238,15 @@ def draw(found: list[dict[str, Any]], path: Path) -> None:
         curves = [one["returns"] for one in found if one["variant"] == variant]
         if not curves:
             continue
-        values = np.array(curves)
+        values = np.array(curves, dtype=float)  # None where no episode ended
         steps = FORMATIONS * STEPS * ROBOTS * (1 + np.arange(values.shape[1])) / 1e6
-        axes.plot(steps, np.median(values, axis=0), color=colour, ls=dashes, label=variant)
-        axes.fill_between(
-            steps, values.min(axis=0), values.max(axis=0), color=colour, alpha=0.15, lw=0
-        )
+        some = np.isfinite(values).any(axis=0)
+        steps, values = steps[some], values[:, some]
+        axes.plot(steps, np.nanmedian(values, axis=0), color=colour, ls=dashes, label=variant)
+        low, high = np.nanmin(values, axis=0), np.nanmax(values, axis=0)
+        axes.fill_between(steps, low, high, color=colour, alpha=0.15, lw=0)
     axes.set_xlabel("robot steps (millions)")
-    axes.set_ylabel("mean return of an episode")
+    axes.set_ylabel("mean return of episodes that ended")
     axes.legend(fontsize=8, frameon=False)
     tidy(axes)
     with atomic(path, "wb") as file:

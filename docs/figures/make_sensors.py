@@ -43,13 +43,14 @@ def judged(policy: str) -> dict[str, Any]:
 def of_training(folder: Path) -> dict[str, Any]:
     """Scores after the imitation and at the end, and the cost, from a training's curve."""
     curve = json.loads((folder / "curve.json").read_text(encoding="utf-8"))
-    first, *_ = curve["evaluations"]
+    first, *_, last = curve["evaluations"]
     kept = min(curve["evaluations"], key=lambda one: one["score_mm"])
     return {
         "imitated_mm": first["score_mm"],
+        "ended_mm": last["score_mm"],
         "kept_mm": kept["score_mm"],
         "kept_at": kept["robot_steps"],
-        "minutes": curve["processor_time_s"] / 60,
+        "minutes": curve["wall_time_s"] / 60,
     }
 
 
