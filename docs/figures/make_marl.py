@@ -12,7 +12,7 @@ import argparse
 import json
 import time
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from make_board import DOCS
@@ -30,21 +30,39 @@ FORMATIONS, STEPS, ROLLOUTS = 64, 128, 40  # of a rollout: formations and contro
 ROBOTS, JUDGED, HORIZON_S, SETTLED_S = 3, 50, 60.0, 24.0
 SEEDS = 5
 CELLS = ("nominal", "slip")
-# Algorithm, whether the robots share one network, and whether a central critic sees `state()`; if not, it
-# sees the observations of all robots.
+FEWEST = 3  # training seeds that an interval needs
+
+
+class Variant(NamedTuple):
+    """An algorithm, and what its critic is."""
+
+    algorithm: str
+    shared: bool = True  # one network of the actor for all robots
+    true_state: bool = (
+        True  # a central critic sees `state()`; if not, the observations of all robots
+    )
+    one_value: bool = (
+        True  # a central critic has one value for the formation; if not, one for each robot
+    )
+
+
 VARIANTS = {
-    "IPPO": ("Ippo", True, True),
-    "MAPPO": ("Mappo", True, True),
-    "MAPPO, all observations": ("Mappo", True, False),
-    "IPPO, a network for each robot": ("Ippo", False, True),
-    "MAPPO, a network for each robot": ("Mappo", False, True),
+    "IPPO": Variant("Ippo"),
+    "MAPPO": Variant("Mappo"),
+    "MAPPO, all observations": Variant("Mappo", true_state=False),
+    "MAPPO, a value for each robot": Variant("Mappo", one_value=False),
+    "MAPPO, a value for each robot, all observations": Variant(
+        "Mappo", true_state=False, one_value=False
+    ),
+    "IPPO, a network for each robot": Variant("Ippo", shared=False),
 }
 STYLES = {
     "IPPO": ("#0072B2", "-"),
     "MAPPO": ("#D55E00", "--"),
     "MAPPO, all observations": ("#CC79A7", (0, (5, 1, 1, 1, 1, 1))),
-    "IPPO, a network for each robot": ("#009E73", "-."),
-    "MAPPO, a network for each robot": ("#000000", ":"),
+    "MAPPO, a value for each robot": ("#009E73", "-."),
+    "MAPPO, a value for each robot, all observations": ("#000000", ":"),
+    "IPPO, a network for each robot": ("#56B4E9", (0, (1, 1))),
 }
 
 
@@ -62,21 +80,22 @@ def experiment(variant: str, seed: int) -> Any:
     from baselines.benchmarl import FormationTask
 
     torch.set_num_threads(1)
-    name, shared, true_state = VARIANTS[variant]
+    wanted = VARIANTS[variant]
     task = FormationTask.INFINITY.get_from_yaml()
-    if not true_state:
+    if not wanted.true_state:
         task.state_spec = no_state
     task.config.update(horizon_s=66.0, infos=())
     config = ExperimentConfig.get_from_yaml()
     config.loggers, config.render, config.evaluation = [], False, False
-    config.share_policy_params = shared
+    config.share_policy_params = wanted.shared
     config.max_n_iters, config.max_n_frames = ROLLOUTS, None
     config.on_policy_n_envs_per_worker = FORMATIONS
     config.on_policy_collected_frames_per_batch = FORMATIONS * STEPS
     config.on_policy_minibatch_size, config.on_policy_n_minibatch_iters = 341, 10
     config.lr, config.gamma, config.clip_grad_val = 1e-3, 0.99, 0.5
     config.save_folder = str(RUNS)
-    algorithm = getattr(algorithms, f"{name}Config").get_from_yaml()
+    algorithm = getattr(algorithms, f"{wanted.algorithm}Config").get_from_yaml()
+    algorithm.share_param_critic = wanted.one_value
     algorithm.entropy_coef, algorithm.lmbda = 0.0, 0.95
     algorithm.scale_mapping = "biased_softplus_0.5"
     network = MlpConfig(
@@ -178,17 +197,23 @@ def line(one: dict[str, Any]) -> str:
 
 def shown(mean: float, half: float) -> str:
     """A geometric mean and its interval, from their logarithms to base 10."""
-    middle, low, high = (10.0**value for value in (mean, mean - half, mean + half))
-    return f"{middle:.3g} [{low:.3g}, {high:.3g}]"
+    middle, low, high = (digits(10.0**value) for value in (mean, mean - half, mean + half))
+    return f"{middle} [{low}, {high}]"
+
+
+def digits(value: float) -> str:
+    """A number with three digits, without an exponent."""
+    return f"{float(f'{value:.3g}'):.10g}"
 
 
 def interval(values: list[float]) -> str:
     """Geometric mean of the seeds' values with the 95 % interval of Student's t for their logarithms."""
     from scipy.stats import t
 
-    logs, half = np.log10(values), 0.0
-    if len(values) > 1:
-        half = t.ppf(0.975, len(values) - 1) * np.std(logs, ddof=1) / np.sqrt(len(values))
+    logs = np.log10(values)
+    if len(values) < FEWEST:
+        return digits(10.0 ** float(np.mean(logs)))
+    half = t.ppf(0.975, len(values) - 1) * np.std(logs, ddof=1) / np.sqrt(len(values))
     return shown(float(np.mean(logs)), float(half))
 
 
@@ -196,7 +221,7 @@ def ratio(values: list[float], others: list[float]) -> str:
     """Ratio of two geometric means with the 95 % interval of Welch's t for the logarithms."""
     from scipy.stats import ttest_ind
 
-    if len(values) < 2:
+    if len(values) < FEWEST:
         return ""
     mine, theirs = np.log10(values), np.log10(others)
     low, high = ttest_ind(mine, theirs, equal_var=False).confidence_interval(0.95)
