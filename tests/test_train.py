@@ -164,9 +164,8 @@ def command(tmp_path: Path, *words: str, **changes: object) -> list[str]:
 
 def test_without_its_packages_training_reports_what_to_install(tmp_path, monkeypatch, capsys):
     monkeypatch.setitem(sys.modules, "stable_baselines3", None)
-    loaded = [
-        name for name in sys.modules if name.startswith(("baselines.training", "baselines.sb3"))
-    ]
+    first = ("baselines.training", "baselines.sb3", "baselines.commands")
+    loaded = [name for name in sys.modules if name.startswith(first)]
     for name in loaded:
         monkeypatch.delitem(sys.modules, name)
     monkeypatch.setattr("sys.argv", command(tmp_path))
