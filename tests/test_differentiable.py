@@ -14,17 +14,17 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tlf_env.engine import readout
+from tlf_env.engine.batch import BatchPlant
+from tlf_env.engine.settings import make_settings
+from tlf_env.onboard.observer import Message, dead_reckoned
+from tlf_env.onboard.tracking import body_errors
+from tlf_env.task.actions import led_reference, residual_share, twist_action
+from tlf_env.task.observation import tracking_entries
+from tlf_env.task.reward import reward_terms
+
 torch = pytest.importorskip("torch")
 pytest.importorskip("stable_baselines3")
-
-from tlf_env.engine import readout  # noqa: E402
-from tlf_env.engine.batch import BatchPlant  # noqa: E402
-from tlf_env.engine.settings import make_settings  # noqa: E402
-from tlf_env.onboard.observer import Message, dead_reckoned  # noqa: E402
-from tlf_env.onboard.tracking import body_errors  # noqa: E402
-from tlf_env.task.actions import led_reference, residual_share, twist_action  # noqa: E402
-from tlf_env.task.observation import tracking_entries  # noqa: E402
-from tlf_env.task.reward import reward_terms  # noqa: E402
 
 DOCS = Path(__file__).resolve().parents[1] / "docs"
 

@@ -19,6 +19,8 @@ from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import SENSOR_TAIL_ENTRIES
 
 BATCH = 1024
+# Scales of the reference's speed and yaw rate in the observation.
+ENTRY_SCALES = tuple(SENSOR_TAIL_ENTRIES[f"message_u_{i}"].scale for i in (1, 2))
 EVERY = 2  # control steps between two rows: rows of neighbouring steps are nearly the same
 NOISE_KEPT = 0.95  # of the noise on the actions from step to step, so that it moves robots
 SCALES = (10.0, 0.1)  # mm/s and rad/s: errors of the twist beyond this count linearly
@@ -79,7 +81,6 @@ def _drive(
     """A round: the network drives, or the teacher if it is not ``alone``."""
     extractor, layer = model.policy.mlp_extractor, envs.layer
     steps = -(-wanted.robot_steps // (envs.num_envs * wanted.rounds))
-    entry_scales = np.array([SENSOR_TAIL_ENTRIES[f"message_u_{i}"].scale for i in (1, 2)])
     twist_scales = np.array([FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S])
     features, added, truths, rewards, dones = [], [], [], [], []
     noise, observations = np.zeros((envs.num_envs, 2)), envs.observations()
@@ -90,11 +91,11 @@ def _drive(
         with torch.no_grad():
             found = extractor.features(read)
         if k % EVERY == 0:
-            reference = observations[:, list(layer.twist)] * entry_scales
+            reference = observations[:, list(layer.twist)] * ENTRY_SCALES
             features.append(found.half())  # half the memory; features are within ±10
             added.append(torch.from_numpy(((twist - reference) / SCALES).astype(np.float32)))
             truths.append(observations[:, -TRUTHS:].copy())
-        actions = twist / entry_scales @ layer.wheels.T
+        actions = twist / ENTRY_SCALES @ layer.wheels.T
         if alone:
             actions, _ = model.predict(observations, deterministic=True)
         noise = NOISE_KEPT * noise
@@ -143,9 +144,10 @@ def loss_of(policy: SensorPolicy, features: torch.Tensor, added: torch.Tensor) -
     """How far the actor's twists are from the teacher's: the mean of a smooth error."""
     known = features.float()
     actions = policy.action_net(policy.mlp_extractor.of_features(known))
-    entry_scales = torch.tensor([SENSOR_TAIL_ENTRIES[f"message_u_{i}"].scale for i in (1, 2)])
     to_twist = torch.linalg.inv(torch.from_numpy(policy.layer.wheels)).float()
-    mine = (actions @ to_twist.T - known[:, -2:]) * entry_scales / torch.tensor(SCALES)
+    mine = (
+        (actions @ to_twist.T - known[:, -2:]) * torch.tensor(ENTRY_SCALES) / torch.tensor(SCALES)
+    )
     return torch.nn.functional.smooth_l1_loss(mine, added, beta=KNEE)
 
 
