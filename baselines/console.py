@@ -15,8 +15,6 @@ import typer
 from rich.console import Console
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tlf_env.common.errors import install_command
-
 if TYPE_CHECKING:
     from tlf_env.task.scenario import Scenario
 
@@ -82,6 +80,8 @@ def warn_of_scenarios(scenarios: Iterable[tuple[str, Scenario]]) -> None:
 
 def warn_of_missing(error: ModuleNotFoundError) -> None:
     """Say that figures are left out because a package is missing."""
+    from tlf_env.common.errors import install_command
+
     hint = f"No figures: {error.name} is missing ({install_command('figures')})."
     notes.print(hint, soft_wrap=True)
 

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import inspect
 import io
 import json
+import os
 import shlex
+import subprocess
 import sys
+from typing import get_args
 
 import gymnasium
 import pettingzoo
@@ -15,12 +19,16 @@ from helpers import refused
 
 import tlf_env
 from baselines import cli
+from baselines.cli import options
 from baselines.commands import catalogue, scenarios
 from baselines.commands.examples import EXAMPLES
+from baselines.policies.laws.catalogue import LAWS
 from baselines.policies.learned import shipped_policies
 from baselines.policies.systems import ESTIMATORS
-from tlf_env.common.presets import KINDS, parsed_yaml, preset_names
-from tlf_env.task.scenario import load_scenario
+from tlf_env.common.presets import KINDS, first_sentence, parsed_yaml, preset_names
+from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
+from tlf_env.task.actions import ACTION_KINDS
+from tlf_env.task.scenario import Scenario, load_scenario
 
 CHANGED = {
     "name": "infinity",
@@ -43,7 +51,7 @@ def test_every_preset_is_listed_with_a_line():
     found = catalogue.catalogue()
     listed = {name for names in found.values() for name in names}
     for kind in KINDS:
-        law = kind in catalogue.LAWS
+        law = kind in catalogue.LAW_LINES
         prefix = "reference:" if kind == "controller" else f"{kind}:" if law else ""
         assert {f"{prefix}{name}" for name in preset_names(kind)} <= listed
     for names in found.values():
@@ -53,12 +61,13 @@ def test_every_preset_is_listed_with_a_line():
 
 
 def test_what_is_no_preset_is_listed_too():
-    assert set(shipped_policies()) <= set(catalogue.policies())
+    docstrings = {name: first_sentence(inspect.getdoc(kind)) for name, (kind, _) in LAWS.items()}
+    assert docstrings == catalogue.LAW_LINES
+    assert list(catalogue.LEARNED_LINES) == shipped_policies()
     assert set(catalogue.ESTIMATOR_LINES) == set(ESTIMATORS)
-    assert set(catalogue.ACTION_LINES) == set(catalogue.ACTION_KINDS)
-    assert set(catalogue.PLANT_LINES) == set(catalogue.plants()) == {
-        "pymunk", "batch", "kinematic", "chipmunk",
-    }  # fmt: skip
+    assert set(catalogue.ACTION_LINES) == set(ACTION_KINDS)
+    assert set(catalogue.PLANT_LINES) == set(get_args(Scenario.model_fields["plant"].annotation))
+    assert set(catalogue.policies()) >= {*LAWS, *shipped_policies(), *catalogue.POLICY_FORMS}
 
 
 def test_a_list_is_printed_for_a_kind_and_as_json(capsys):
@@ -76,6 +85,71 @@ def test_names_are_completed(capsys):
 
 def test_the_version_is_printed(capsys):
     assert printed(capsys, "--version") == f"tlf_env {tlf_env.__version__}\n"
+
+
+# --- what a start imports
+
+# Modules that take long to import; pydantic is none of them, as typer needs it to read options.
+HEAVY = ("numba", "llvmlite", "scipy", "pymunk", "matplotlib", "torch", "safetensors")
+LIBRARIES = (*HEAVY, "numpy", "gymnasium", "pettingzoo", "yaml", "tlf_env")
+COMMANDS = [
+    command.name or command.callback.__name__ for command in cli.app.registered_commands
+] + [
+    command.name or command.callback.__name__
+    for group in cli.app.registered_groups
+    for command in group.typer_instance.registered_commands
+]
+
+
+def imported_by(code: str, *words: str, **variables: str) -> set[str]:
+    """The packages that a fresh Python has imported at the end of some code."""
+    ending = "import atexit, sys; atexit.register(lambda: print('imported', *sys.modules)); "
+    done = subprocess.run(
+        [sys.executable, "-c", ending + code, *words],
+        capture_output=True,
+        text=True,
+        check=True,
+        env={**os.environ, **variables},
+    )
+    return {name.partition(".")[0] for name in done.stdout.rpartition("imported ")[2].split()}
+
+
+def imported_by_tlf(*words: str, **variables: str) -> set[str]:
+    code = "sys.argv[0] = 'tlf'; from baselines.cli import main; main()"
+    return imported_by(code, *words, **variables)
+
+
+def test_the_package_imports_only_what_registers_its_tasks():
+    found = imported_by("import tlf_env; assert tlf_env.TASKS and tlf_env.__version__")
+    assert not found & {*HEAVY, "pydantic", "yaml", "typer", "rich"}
+    assert {"gymnasium", "pettingzoo"} <= found  # their registries hold the tasks
+
+
+@pytest.mark.parametrize(
+    "words", [["--help"], ["--version"], *([name, "--help"] for name in COMMANDS)]
+)
+def test_help_imports_neither_the_package_nor_a_library(words):
+    assert "run" in COMMANDS
+    found = imported_by_tlf(*words)
+    assert "typer" in found
+    assert not found & set(LIBRARIES)
+
+
+def test_a_list_imports_no_heavy_module():
+    assert not imported_by_tlf("list") & set(HEAVY)
+
+
+def test_completion_imports_no_heavy_module():
+    asked = {"_TLF_COMPLETE": "complete_bash", "COMP_CWORD": "3"}
+    words = {"COMP_WORDS": "tlf run --policy kana"}
+    assert not imported_by_tlf(**asked, **words) & set(HEAVY)
+    commands = {**asked, "COMP_WORDS": "tlf ru", "COMP_CWORD": "1"}
+    assert not imported_by_tlf(**commands) & set(LIBRARIES)
+
+
+def test_the_default_of_the_options_is_the_default_controller():
+    assert f"reference:{DEFAULT_CONTROLLER}" == options.DEFAULT_SYSTEM
+    assert options.named_policy("reference", None) == options.DEFAULT_SYSTEM
 
 
 # --- show and --set

@@ -22,7 +22,6 @@ from baselines.console import (
     warn_of_scenarios,
     whole_numbers,
 )
-from tlf_env.common.errors import install_command
 
 commands = typer.Typer()
 
@@ -87,6 +86,8 @@ def train(
     try:
         from baselines.commands.train import search_command, train_command
     except ModuleNotFoundError as error:
+        from tlf_env.common.errors import install_command
+
         raise ValueError(f"training needs {error.name} ({install_command('train')})") from error
     if search:
         search_command(

@@ -12,6 +12,7 @@ import typer
 
 from baselines.cli.app import FAILED, completed
 from baselines.cli.options import (
+    DEFAULT_SYSTEM,
     RAY,
     REPLAYS,
     TRUST,
@@ -27,7 +28,6 @@ from baselines.console import (
     whole_numbers,
     writable_folder,
 )
-from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 
 commands = typer.Typer()
 
@@ -286,7 +286,7 @@ def eval_(
         typer.Option(
             help="The policy that it is compared with.", autocompletion=completed("policies")
         ),
-    ] = f"reference:{DEFAULT_CONTROLLER}",
+    ] = DEFAULT_SYSTEM,
     tasks: Annotated[str, typer.Option(help="Scenarios, comma-separated.")] = "infinity,flower",
     disturbances: Annotated[
         str, typer.Option(help="Disturbances, comma-separated: presets or FILE.yaml; or all.")
@@ -393,7 +393,7 @@ def export(
     tasks: Annotated[str, typer.Argument(help="Tasks, comma-separated (see `tlf list tasks`).")],
     policy: Annotated[
         str, typer.Option(help="As in `tlf run --policy`.", autocompletion=completed("policies"))
-    ] = f"reference:{DEFAULT_CONTROLLER}",
+    ] = DEFAULT_SYSTEM,
     disturbances: Annotated[
         str, typer.Option(help="Disturbances, comma-separated: presets or FILE.yaml.")
     ] = "nominal",

@@ -5,7 +5,9 @@ from __future__ import annotations
 import typer
 
 from baselines.cli.app import completed
-from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
+
+DEFAULT_SYSTEM = "reference:linearised"  # written out: `tlf --help` imports nothing of tlf_env
+
 
 SCENARIO = typer.Argument(
     help="Preset (see `tlf list tasks`), YAML file, CSV file of waypoints t_s,x_mm,y_mm, or -: YAML from the "
@@ -88,7 +90,7 @@ def named_policy(policy: str, gains: str | None) -> str:
         for gains with another policy.
     """
     if policy == "reference":
-        return f"reference:{gains or DEFAULT_CONTROLLER}"
+        return f"reference:{gains}" if gains else DEFAULT_SYSTEM
     if gains is not None:
         raise ValueError(f"--gains {gains} needs --policy reference, got {policy!r}")
     return policy

@@ -11,7 +11,6 @@ from baselines.commands.examples import examples
 from baselines.console import (
     listed,
 )
-from tlf_env.common.errors import install_command
 
 commands = typer.Typer()
 
@@ -36,6 +35,8 @@ def paper(
     try:
         from baselines.commands.paper import paper_command
     except ModuleNotFoundError as error:
+        from tlf_env.common.errors import install_command
+
         raise ValueError(f"tlf paper needs {error.name} ({install_command('figures')})") from error
     paper_command(None if figures == "all" else listed(figures), out, as_json=as_json)
 

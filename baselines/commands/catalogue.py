@@ -2,22 +2,26 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Callable
-from typing import get_args
 
 from rich.table import Table
 
 from baselines.console import screen
-from baselines.policies.laws.catalogue import LAWS
-from baselines.policies.learned import shipped_policies
-from baselines.policies.systems import ESTIMATORS
 from tlf_env.common.errors import suggestion
-from tlf_env.common.presets import first_sentence, preset_names, preset_summary
-from tlf_env.onboard.controllers import controller_names
-from tlf_env.task.actions import ACTION_KINDS
-from tlf_env.task.scenario import Scenario
+from tlf_env.common.presets import preset_names, preset_summary
 
+# Written out here, as the modules that define these names import Numba, and `tlf list` and the completion
+# of names in a shell should be quick. Tests compare the names, and the lines of the laws.
+LAW_LINES = {
+    "pure_pursuit": "Steer along the circle through the robot's position and a later position of its "
+    "reference.",
+    "feedback_linearisation": "Input–output linearisation of a point ``ahead_mm`` in front of the axle.",
+    "kanayama": "A stable tracking law whose correction of the heading grows with the reference's speed.",
+    "lqr": "Time-varying linear-quadratic regulator of the errors about the reference's motion.",
+    "sliding_mode": "Sliding mode on the surfaces of Mu, Yan, Spurgeon and Mao, with a boundary layer.",
+    "adrc": "Feedback linearisation with a linear extended state observer on each robot.",
+    "nmpc": "Nonlinear model predictive control by real-time iterations.",
+}
 LEARNED_LINES = {
     "from-nothing": "PPO, without a controller beneath: its action is added to the reference's twist.",
     "residual": "PPO: its action is added to the twist of the default controller.",
@@ -64,9 +68,12 @@ def _presets(kind: str) -> Callable[[], dict[str, str]]:
 
 def controllers() -> dict[str, str]:
     """The controllers on board and the textbook laws."""
-    found = {f"reference:{name}": preset_summary("controller", name) for name in controller_names()}
-    for law, (kind, _) in LAWS.items():
-        found[law] = first_sentence(inspect.getdoc(kind) or "")
+    found = {
+        f"reference:{name}": preset_summary("controller", name)
+        for name in preset_names("controller")
+    }
+    for law, line in LAW_LINES.items():
+        found[law] = line
         for name in preset_names(law):
             found[f"{law}:{name}"] = preset_summary(law, name)
     return found
@@ -74,14 +81,7 @@ def controllers() -> dict[str, str]:
 
 def policies() -> dict[str, str]:
     """What drives the robots of a run: controllers, learned policies, and what a user brings."""
-    learned = {name: LEARNED_LINES[name] for name in shipped_policies()}
-    return controllers() | learned | POLICY_FORMS
-
-
-def plants() -> dict[str, str]:
-    """What moves the robots."""
-    names = get_args(Scenario.model_fields["plant"].annotation)
-    return {name: PLANT_LINES[name] for name in names}
+    return controllers() | LEARNED_LINES | POLICY_FORMS
 
 
 KINDS: dict[str, tuple[str, Callable[[], dict[str, str]]]] = {
@@ -90,14 +90,14 @@ KINDS: dict[str, tuple[str, Callable[[], dict[str, str]]]] = {
     "policies": ("tlf run TASK --policy NAME", policies),
     "estimators": (
         "tlf run TASK --policy CONTROLLER+NAME",
-        lambda: {name: ESTIMATOR_LINES[name] for name in ESTIMATORS},
+        lambda: ESTIMATOR_LINES,
     ),
     "limiters": ("tlf run TASK --policy CONTROLLER+ESTIMATOR+NAME", _presets("limiter")),
     "actions": (
         "gymnasium.make(..., action=NAME)",
-        lambda: {name: ACTION_LINES[name] for name in ACTION_KINDS},
+        lambda: ACTION_LINES,
     ),
-    "plants": ("tlf run TASK --plant NAME", plants),
+    "plants": ("tlf run TASK --plant NAME", lambda: PLANT_LINES),
     "trainings": ("tlf train NAME", _presets("training")),
     "plans": ("tlf bench --plan NAME", _presets("plan")),
     "searches": ("tlf tune NAME", _presets("search")),
