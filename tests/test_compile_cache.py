@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 import errno
+import fcntl
 import functools
 import gc
 import importlib.util
@@ -13,6 +14,7 @@ import shutil
 import stat
 import subprocess
 import sys
+import threading
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import nullcontext
@@ -325,18 +327,55 @@ print(sum(probe.double.stats.cache_hits.values()))
 """
 
 
-def test_processes_that_start_at_once_on_an_empty_cache_all_run(tmp_path):
+def test_of_processes_that_start_at_once_on_an_empty_cache_one_compiles(tmp_path):
     (tmp_path / "probe.py").write_text(SOURCE)
     command = [sys.executable, "-W", "error::RuntimeWarning", "-c", CHILD]
     crowd = [
         subprocess.Popen(command, env=environment(tmp_path), stdout=subprocess.PIPE, text=True)
         for _ in range(4)
     ]
-    assert all(one.communicate() and one.returncode == 0 for one in crowd)
+    found = sorted(one.communicate()[0].split()[0] for one in crowd)  # in the cache, by each
+    assert found == ["0", "1", "1", "1"]
+    assert all(one.returncode == 0 for one in crowd)
     last = subprocess.run(
         command, env=environment(tmp_path), capture_output=True, text=True, check=True
     )
     assert last.stdout.split() == ["1"]
+
+
+def test_a_process_waits_for_another_that_compiles_even_if_that_one_is_killed(
+    cache, hits, tmp_path
+):
+    hits()
+    lock = one(cache, "*.lock")
+    code = f"import fcntl, time; f = open({str(lock)!r}, 'wb'); fcntl.flock(f, fcntl.LOCK_EX); "
+    other = subprocess.Popen(
+        [sys.executable, "-c", code + "print('has it', flush=True); time.sleep(600)"],
+        stdout=subprocess.PIPE,
+        text=True,
+    )
+    assert other.stdout.readline() == "has it\n"
+    assert hits() == 1  # what is in the cache needs no lock
+    waiting = threading.Thread(target=hits, args=(np.float32,))
+    waiting.start()
+    waiting.join(1.0)
+    assert waiting.is_alive()
+    other.kill()
+    other.communicate()
+    waiting.join()
+    assert hits(np.float32) == 1
+
+
+def test_a_driver_that_cannot_be_compiled_lets_others_go_on(cache):
+    @compiled.driver
+    def wrong(a: Any) -> Any:
+        return a.no_such_attribute
+
+    for _ in range(2):
+        with pytest.raises(numba.TypingError):
+            wrong(1.0)
+    with one(cache, "*.lock").open("wb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)  # else BlockingIOError
 
 
 def test_a_read_only_folder_is_read_by_a_process_that_cannot_write_it(tmp_path):

@@ -67,7 +67,8 @@ def thrown_about(lanes: int, seed: int = 0, **overrides: Any) -> tuple[Arrays, S
     a.seeds[:] = seed + np.arange(lanes)
     everyone = np.ones(lanes, dtype=np.bool_)
     drivers.start(a, make_variants([scenario]), everyone, np.zeros((0, 0, 3)), s)
-    drivers.look(a, everyone, True, s)
+    at, nothing = np.arange(lanes), empty_excerpt(a, 0, 0)
+    drivers.control_step(a, at, nothing, drivers.LOOK_AT_START, 0, s)
     for lane in range(lanes):
         rng = np.random.default_rng(1000 * seed + lane)
         robots = a.rows("motion").shape[1]
@@ -88,7 +89,7 @@ def step_all(a: Arrays, s: Settings, *bounds: int) -> Arrays:
         a.actions[:] = actions
         for first, last in zip((0, *bounds), (*bounds, len(a.seeds)), strict=True):
             left, nothing = drivers.lanes_to_step(first, last), empty_excerpt(a, 0, 0)
-            assert drivers.control_step(a, left, nothing, s) == drivers.DONE
+            assert drivers.control_step(a, left, nothing, drivers.WHOLE, 0, s) == drivers.DONE
     return a
 
 

@@ -24,6 +24,7 @@ from tlf_env.engine.layout import (
     fields_of,
     rows_of,
 )
+from tlf_env.numerics.pointers import by_pointer
 from tlf_env.numerics.rows import reader, slot_reader, slot_writer, writer
 from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.estimator import ekf_constants
@@ -54,6 +55,7 @@ class Variants(NamedTuple):
     mixture: np.ndarray  # (variant,): summed shares if every episode draws its variant, else empty
 
 
+@by_pointer
 class Arrays(NamedTuple):
     """``(field, robot, lane)`` unless another shape is given; a lane is one formation.
 

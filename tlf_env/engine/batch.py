@@ -235,7 +235,14 @@ class BatchPlant:
         if result != STARTED:
             why = refusal(arrays, self._variants, result, robot, lane)
             raise ValueError(f"formation {lane}: {why}")
-        drivers.look(arrays, chosen, True, self._settings)
+        drivers.control_step(
+            arrays,
+            np.flatnonzero(chosen),
+            self._nothing,
+            drivers.LOOK_AT_START,
+            0,
+            self._settings,
+        )
 
     def compile_start(self) -> bool:
         """Compile the drivers of a reset, or load them from the cache; nothing is reset.
@@ -246,7 +253,6 @@ class BatchPlant:
         mask = np.zeros(self.formations, dtype=np.bool_)
         compiled = (
             compile_for(drivers.start, arrays, self._variants, mask, self._poses, settings),
-            compile_for(drivers.look, arrays, mask, True, settings),
             compile_for(drivers.excerpt_of, arrays, mask, self._nothing),
         )
         return any(compiled)
@@ -259,11 +265,7 @@ class BatchPlant:
         arrays, settings = self.arrays, self._settings
         left = drivers.lanes_to_step(0, 0)
         compiled = (
-            compile_for(drivers.control_step, arrays, left, self._nothing, settings),
-            compile_for(drivers.actuate, arrays, 0, 0, settings),
-            compile_for(drivers.sense, arrays, 0, 0, settings),
-            compile_for(drivers.transmit, arrays, 0, settings),
-            compile_for(drivers.refer, arrays, 0, 0, 0, settings),
+            compile_for(drivers.control_step, arrays, left, self._nothing, 0, 0, settings),
             compile_for(drivers.mark, arrays, 0, 0, 0),
         )
         return any(compiled)
@@ -325,7 +327,8 @@ class BatchPlant:
             self._base.command(arrays)
         threads = min(self.threads, -(-self.formations // drivers.LANES_AT_ONCE))
         left = drivers.lanes_to_step(0, self.formations, threads)
-        work = (arrays, left, self._nothing if excerpt is None else excerpt, self._settings)
+        out = self._nothing if excerpt is None else excerpt
+        work = (arrays, left, out, drivers.WHOLE, 0, self._settings)
         helpers = [self._others().submit(drivers.control_step, *work) for _ in range(threads - 1)]
         drivers.control_step(*work)
         for helper in helpers:

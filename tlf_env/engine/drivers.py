@@ -48,7 +48,7 @@ from tlf_env.engine.smoothing import smooth
 from tlf_env.engine.starting import STARTED, clear, start_lane
 from tlf_env.engine.substeps import trace_drive
 from tlf_env.engine.tiles import advance
-from tlf_env.numerics.compiled import block, driver, fetch_add, law
+from tlf_env.numerics.compiled import allocating, block, driver, fetch_add, law
 from tlf_env.numerics.philox import unit, words
 from tlf_env.onboard.calibration import believed_odometry
 from tlf_env.onboard.kinds import TRUTH
@@ -77,6 +77,16 @@ from tlf_env.task.actions import (
     wheel_command,
 )
 from tlf_env.task.info import RUNNING
+
+# Parts of a control step, for `control_step`.
+WHOLE = 0
+ACTUATE = (
+    1  # the first half of a substep: all up to the plant's new velocities and poses, or its inputs
+)
+SENSE = 2  # the second half: sensors and estimator, and which outlines meet
+TRANSMIT = 3  # broadcasts, and the next references of some robots
+LOOK = 4  # errors, rewards and observations
+LOOK_AT_START = 5  # the same of an episode that begins
 
 TRACE = in_array("trace")
 TRACE_END = TRACE + len(Trace._fields)
@@ -219,11 +229,14 @@ def look_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
 
 
 @block
-def transmit_all(arrays: Arrays, first: int, last: int, settings: Settings) -> None:
-    """:func:`transmit_lane` of the lanes from ``first`` to before ``last``, and their next references."""
+def transmit_all(arrays: Arrays, first: int, last: int, referred: int, settings: Settings) -> None:
+    """:func:`transmit_lane` of the lanes from ``first`` to before ``last``.
+
+    Then the next references of the first robots, ``referred`` of each.
+    """
     for lane in range(first, last):
         transmit_lane(arrays, lane, settings)
-        for robot in range(arrays.states.shape[1]):
+        for robot in range(referred):
             next_reference(
                 arrays, lane, robot, arrays.clock[lane, 1] + settings.lookahead, settings
             )
@@ -302,29 +315,12 @@ def start(
     return STARTED, 0, 0
 
 
-@driver
-def look(arrays: Arrays, mask: np.ndarray, at_start: bool, settings: Settings) -> None:
-    """:func:`look_lane` of the lanes of the mask; a robot that starts lost counts as lost in the first step."""
-    for lane in range(mask.shape[0]):
-        if mask[lane]:
-            look_all(arrays, lane, lane + 1, settings)
-            if at_start:
-                for robot in range(arrays.ends.shape[1]):
-                    arrays.lost[lane, robot] = arrays.lost_now[lane, robot] = False
-                    arrays.ends[lane, robot] = RUNNING
-
-
-@driver
-def transmit(arrays: Arrays, lane: int, settings: Settings) -> None:
-    """:func:`transmit_lane`."""
-    transmit_lane(arrays, lane, settings)
-
-
-@driver
-def refer(arrays: Arrays, lane: int, first: int, last: int, settings: Settings) -> None:
-    """The next references of the robots from ``first`` to before ``last``."""
-    for robot in range(first, last):
-        next_reference(arrays, lane, robot, arrays.clock[lane, 1] + settings.lookahead, settings)
+@block
+def forget_losses(arrays: Arrays, lane: int) -> None:
+    """A robot that starts lost counts as lost in the first step."""
+    for robot in range(arrays.ends.shape[1]):
+        arrays.lost[lane, robot] = arrays.lost_now[lane, robot] = False
+        arrays.ends[lane, robot] = RUNNING
 
 
 @block
@@ -338,15 +334,6 @@ def find_near(arrays: Arrays, first: int, last: int, near: np.ndarray, settings:
             away_from_walls(arrays, lane, settings.period)
             and room_to_move(arrays, lane, settings.period)
         )
-
-
-@driver
-def actuate(arrays: Arrays, lane: int, substep: int, settings: Settings) -> None:
-    """The first half of a substep of a lane: everything up to the plant's new velocities and poses.
-
-    On the plant ``chipmunk`` everything up to the plant, whose inputs are written.
-    """
-    advance(arrays, np.full(1, lane), substep, substep + 1, True, False, settings)
 
 
 @driver
@@ -364,14 +351,6 @@ def account(arrays: Arrays, lane: int, settings: Settings) -> None:
         write_trace(arrays.states, robot, lane, trace)
 
 
-@driver
-def sense(arrays: Arrays, lane: int, substep: int, settings: Settings) -> None:
-    """The second half of a substep of a lane: sensors and estimator, and which outlines meet."""
-    advance(arrays, np.full(1, lane), substep, substep + 1, False, True, settings)
-    if settings.round_outlines:
-        mark_touched(arrays, lane)
-
-
 @block
 def mark_all_touched(arrays: Arrays, lanes: np.ndarray) -> None:
     """:func:`mark_touched` of some lanes."""
@@ -380,7 +359,7 @@ def mark_all_touched(arrays: Arrays, lanes: np.ndarray) -> None:
 
 
 def lanes_to_step(first: int, last: int, threads: int = 1) -> np.ndarray:
-    """The lanes from ``first`` to before ``last``, for as many calls of :func:`control_step` at once."""
+    """The lanes from ``first`` to before ``last``, for as many calls with :data:`WHOLE` at once."""
     return np.array([first, last, threads])
 
 
@@ -393,8 +372,8 @@ def take_lanes(left: np.ndarray) -> tuple[int, int]:
     return begin, min(begin + count, left[1])
 
 
-@driver
-def control_step(arrays: Arrays, left: np.ndarray, out: Excerpt, settings: Settings) -> int:
+@allocating
+def whole_step(arrays: Arrays, left: np.ndarray, out: Excerpt, settings: Settings) -> int:
     """A whole control step of lanes (see :func:`lanes_to_step`) until none is left, and their excerpt.
 
     Returns ``DONE``; or the number of the first robot whose action is not finite (see
@@ -434,8 +413,47 @@ def control_step(arrays: Arrays, left: np.ndarray, out: Excerpt, settings: Setti
             for substep in range(settings.substeps if close > 0 else 0):
                 advance(arrays, lanes, substep, substep + 1, True, True, settings)
                 mark_all_touched(arrays, lanes)
-            transmit_all(arrays, begin, end, settings)
+            transmit_all(arrays, begin, end, arrays.states.shape[1], settings)
             look_all(arrays, begin, end, settings)
             write_excerpt(arrays, begin, end, out)
         first, last = take_lanes(left)
+    return DONE
+
+
+@driver
+def control_step(
+    arrays: Arrays, lanes: np.ndarray, out: Excerpt, part: int, number: int, settings: Settings
+) -> int:
+    """A control step, or a part of one, in one driver: what its parts share is compiled once.
+
+    Parameters
+    ----------
+    lanes
+        As :func:`lanes_to_step` gives them for :data:`WHOLE`, otherwise the numbers of some lanes.
+    out
+        Where :data:`WHOLE` writes an excerpt.
+    part
+        One of the parts above.
+    number
+        The substep of :data:`ACTUATE` and :data:`SENSE`; how many robots of each lane get their next
+        reference in :data:`TRANSMIT`.
+
+    Returns
+    -------
+    What :func:`whole_step` returns; ``DONE`` after another part.
+    """
+    if part == WHOLE:
+        return whole_step(arrays, lanes, out, settings)
+    if part in (ACTUATE, SENSE):
+        advance(arrays, lanes, number, number + 1, part == ACTUATE, part == SENSE, settings)
+        if part == SENSE and settings.round_outlines:
+            mark_all_touched(arrays, lanes)
+        return DONE
+    for i in range(lanes.shape[0]):
+        if part == TRANSMIT:
+            transmit_all(arrays, lanes[i], lanes[i] + 1, number, settings)
+        else:
+            look_all(arrays, lanes[i], lanes[i] + 1, settings)
+        if part == LOOK_AT_START:
+            forget_losses(arrays, lanes[i])
     return DONE

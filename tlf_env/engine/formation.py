@@ -81,6 +81,7 @@ TOUCHED_BY = {
 }
 USUAL_START = Start(poses=None, phases_s=None)
 ALONE = np.ones(1, dtype=np.bool_)
+FIRST_LANE = np.zeros(1, dtype=np.int64)
 NO_POSES = np.zeros((0, 0, 3))
 DELIVERED = [Traction._fields.index(name) for name in ("delivered_l", "delivered_r")]
 
@@ -150,7 +151,7 @@ class Formation:
         ]
         self.plant.reset(arrays.rows("body")[:, :, 0], offsets_s)
         self._parts.reset(arrays, settings)
-        drivers.look(arrays, ALONE, True, settings)
+        self._do(drivers.LOOK_AT_START)
         if self._has_rays:
             self._look_at_objects()
 
@@ -226,7 +227,7 @@ class Formation:
         self._left[0] = 0
         by_substep = objects == WITHIN_REACH and not settings.has_parts
         given = settings._replace(has_parts=True) if by_substep else settings
-        result = drivers.control_step(arrays, self._left, self._nothing, given)
+        result = drivers.control_step(arrays, self._left, self._nothing, drivers.WHOLE, 0, given)
         if objects == OUT_OF_REACH and result in (drivers.DONE, drivers.MUST_SUBSTEP):
             self.plant.advance_objects(arrays.rows("motion"), step, settings.substeps, settings.dt)
         if result == drivers.DONE:
@@ -243,15 +244,17 @@ class Formation:
             )
         finally:
             self.plant.release()
-        drivers.transmit(arrays, 0, settings)
-        drivers.refer(
-            arrays, 0, 0, 1 if settings.external_observer else self.scenario.robot_count, settings
-        )
+        referred = 1 if settings.external_observer else self.scenario.robot_count
+        self._do(drivers.TRANSMIT, referred)
         if settings.external_observer:
             self._parts.observe(arrays, settings)
-        drivers.look(arrays, ALONE, False, settings)
+        self._do(drivers.LOOK)
         if self._has_rays:
             self._look_at_objects()
+
+    def _do(self, part: int, number: int = 0) -> None:
+        """A part of a control step; see :func:`~tlf_env.engine.drivers.control_step`."""
+        drivers.control_step(self.arrays, FIRST_LANE, self._nothing, part, number, self._settings)
 
     def _look_at_objects(self) -> None:
         """Let the rays of the range sensors meet what only the space contains."""
@@ -270,7 +273,7 @@ class Formation:
         for substep in range(settings.substeps):
             self._parts.drive(arrays, substep, settings)
             before = motion.copy() if close else motion
-            drivers.actuate(arrays, 0, substep, settings)
+            self._do(drivers.ACTUATE, substep)
             if isinstance(self.plant, ChipmunkPlant):
                 inputs, contact = arrays.inputs, arrays.rows("contact")
                 floors, pushes = inputs[FLOOR_INPUT:PUSH_INPUT], inputs[PUSH_INPUT:]
@@ -278,7 +281,7 @@ class Formation:
                 drivers.account(arrays, 0, settings)
             elif close:
                 self.plant.collide(before, motion, settings.dt)
-            drivers.sense(arrays, 0, substep, settings)
+            self._do(drivers.SENSE, substep)
             for robot, body_type in self.plant.hits.items() if close else ():
                 drivers.mark(arrays, 0, robot, TOUCHED_BY[body_type])
             self._parts.estimate(arrays, substep, settings)

@@ -6,6 +6,7 @@ import math
 from typing import NamedTuple
 
 from tlf_env.disturbances.model import changes_within_episode
+from tlf_env.numerics.pointers import by_pointer
 from tlf_env.onboard.kinds import ESTIMATOR_CODES, EXTERNAL
 from tlf_env.onboard.limiters import behind
 from tlf_env.onboard.observer import ObserverParameters
@@ -17,6 +18,7 @@ from tlf_env.task.observation import neighbour_place
 from tlf_env.task.scenario import Scenario
 
 
+@by_pointer
 class Settings(NamedTuple):
     """Numbers of a scenario that all robots share."""
 

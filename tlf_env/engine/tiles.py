@@ -597,7 +597,7 @@ def advance(
     advance_in(np.empty((TILE_ROWS, WIDTH)), arrays, lanes, begin, end, actuates, senses, settings)
 
 
-@block
+@law
 def advance_in(
     tile: np.ndarray,
     arrays: Arrays,

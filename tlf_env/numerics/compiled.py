@@ -22,6 +22,7 @@ import tempfile
 import warnings
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from io import BufferedWriter
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -41,10 +42,24 @@ from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.registry import CPUDispatcher
-from numba.core.typed_passes import NativeLowering
+from numba.core.typed_passes import NativeLowering, NopythonRewrites
+from numba.core.untyped_passes import (
+    FindLiterallyCalls,
+    InlineClosureLikes,
+    LiteralPropagationSubPipelinePass,
+    LiteralUnroll,
+    MakeFunctionToJitFunction,
+    RewriteDynamicRaises,
+    WithLifting,
+)
 from numba.extending import intrinsic
 
 from tlf_env.common.errors import shown
+
+try:
+    import fcntl
+except ImportError:  # not a system of the Unix kind
+    fcntl = None  # type: ignore[assignment]
 
 F = TypeVar("F", bound=Callable[..., Any])
 
@@ -228,22 +243,55 @@ class _Files(IndexDataCacheFile):
 
 
 class _Cache(FunctionCache):
-    """Numba's cache of a driver. It only saves time: what cannot be read is compiled, and kept if possible."""
+    """Numba's cache of a driver. It only saves time: what cannot be read is compiled, and kept if possible.
+
+    Of several processes that find nothing at once, one compiles, and the others wait and read what it keeps.
+    """
 
     _impl_class = _Implementation
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
+        self._locked: BufferedWriter | None = None
         locator = self._impl.locator
         self._cache_file = _Files(
             self._cache_path, self._impl.filename_base, locator.get_source_stamp()
         )
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
+        found = self._load(sig, target_context)
+        if found is None and self._lock():
+            found = self._load(sig, target_context)
+        return found
+
+    def _load(self, sig: Any, target_context: Any) -> Any:
         try:
             return super().load_overload(sig, target_context)
         except Exception:  # as above
             return None
+
+    def _lock(self) -> bool:
+        """Wait until no other process compiles this driver; whether that can be known.
+
+        The system takes the lock back when this process ends, whatever the reason.
+        """
+        if fcntl is None or self._locked is not None:
+            return False
+        path = Path(self._cache_path) / f"{self._impl.filename_base}.lock"
+        try:
+            self._impl.locator.ensure_cache_path()
+            self._locked = path.open("wb")
+            fcntl.flock(self._locked, fcntl.LOCK_EX)
+        except OSError:  # a folder that cannot be written, or a file system without locks
+            self.unlock()
+            return False
+        return True
+
+    def unlock(self) -> None:
+        """Let other processes go on."""
+        if self._locked is not None:
+            self._locked.close()
+            self._locked = None
 
     def save_overload(self, sig: Any, data: Any) -> None:
         try:
@@ -282,12 +330,26 @@ class _LinkedLowering(NativeLowering):
         return True
 
 
+# Passes over what no law has: closures, contexts, raised errors, loops over tuples, arithmetic of arrays.
+NOT_IN_LAWS = (
+    FindLiterallyCalls,
+    InlineClosureLikes,
+    LiteralPropagationSubPipelinePass,
+    LiteralUnroll,
+    MakeFunctionToJitFunction,
+    NopythonRewrites,
+    RewriteDynamicRaises,
+    WithLifting,
+)
+
+
 class _LinkedCompiler(CompilerBase):
     def define_pipelines(self) -> list[PassManager]:
         manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
         manager.passes = [
             (_LinkedLowering if one is NativeLowering else one, what)
             for one, what in manager.passes
+            if one not in NOT_IN_LAWS
         ]
         manager.finalize()
         return [manager]
@@ -308,7 +370,11 @@ def _few_collections() -> Iterator[None]:
 class _Driver(CPUDispatcher):
     def compile(self, sig: Any) -> Any:
         with _few_collections():
-            return super().compile(sig)
+            try:
+                return super().compile(sig)
+            finally:
+                if isinstance(self._cache, _Cache):
+                    self._cache.unlock()
 
 
 class _Inner(CPUDispatcher):
@@ -316,6 +382,11 @@ class _Inner(CPUDispatcher):
 
     What Python needs to call a function takes long to compile, most of all for tuples of arrays.
     """
+
+    def get_call_template(self, args: Any, kws: Any) -> Any:
+        """What a call has: a constant argument is one of its type, not a function of its own."""
+        plain = {name: types.unliteral(one) for name, one in kws.items()}
+        return super().get_call_template(tuple(types.unliteral(one) for one in args), plain)
 
     def _insert(self, *_: Any) -> None:
         """Keep what was compiled from Python, which could not call it."""
@@ -357,9 +428,10 @@ def law(function: F) -> F:
 def block(function: F) -> F:
     """Compile a larger law that is called rather than inlined, to keep compile times short.
 
-    A call copies the whole tuple of arrays, so that a block is best a loop over robots or lanes.
+    Numba would inline it all the same where a law calls it, as what it compiles for a function takes over
+    that function's options, unless they are set.
     """
-    return _inner(function, _nrt=False)
+    return _inner(function, forceinline=False, _nrt=False)
 
 
 def view(function: F) -> F:
@@ -369,8 +441,8 @@ def view(function: F) -> F:
 
 
 def allocating(function: F) -> F:
-    """Compile a short function that makes an array and passes it to a block."""
-    return _inner(function, forceinline=True)
+    """Compile a block that makes an array and works on it by laws, which see its shape."""
+    return _inner(function, forceinline=False)
 
 
 def driver(function: F) -> F:

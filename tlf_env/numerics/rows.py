@@ -1,9 +1,19 @@
-"""Compiled access to rows: named tuples of numbers, in arrays, rings and tiles."""
+"""Compiled access to rows: named tuples of numbers, in arrays, rings and tiles.
+
+The fields of a row lie along the first axis of a C-contiguous array. One place is computed for all of them,
+as compiling an indexing for each would take most of the time that these functions take. Indices must not
+be negative.
+"""
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from typing import Any
+
+from numba.core import types
+from numba.extending import intrinsic
+from numba.np.arrayobj import load_item, make_array, store_item
 
 from tlf_env.numerics.compiled import law
 
@@ -30,51 +40,92 @@ def replacing(row: type[Any], *names: str) -> Callable[..., Any]:
     return law(scope["replace"])
 
 
+def _places(context: Any, builder: Any, kinds: Any, array: Any, index: Any, first: int) -> Any:
+    """Pointers to the fields of a row at an index of the axes after the first, from field ``first`` on."""
+    array_type, index_type = kinds
+    if array_type.layout != "C":
+        raise TypeError(f"rows need a C-contiguous array, got {array_type}")
+    made = make_array(array_type)(context, builder, array)
+    shape = [builder.extract_value(made.shape, axis) for axis in range(array_type.ndim)]
+    place, size = context.get_constant(types.intp, 0), context.get_constant(types.intp, 1)
+    for axis, length in enumerate(shape[1:]):
+        one = context.cast(
+            builder, builder.extract_value(index, axis), index_type[axis], types.intp
+        )
+        place = builder.add(builder.mul(place, length), one)
+        size = builder.mul(size, length)
+    for field in itertools.count(first):
+        offset = builder.mul(context.get_constant(types.intp, field), size)
+        yield builder.gep(made.data, [builder.add(offset, place)])
+
+
+def _getter(row: type[Any], first: int) -> Callable[..., Any]:
+    """In compiled code ``get(array, index)``: the row at an index of the axes after the first."""
+
+    @intrinsic
+    def get(_context: Any, array: Any, index: Any) -> Any:
+        result = types.BaseTuple.from_types((array.dtype,) * len(row._fields), row)
+
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            places = _places(context, builder, signature.args, *args, first)
+            values = [load_item(context, builder, array, next(places)) for _ in row._fields]
+            return context.make_tuple(builder, result, values)
+
+        return result(array, index), generate
+
+    found: Callable[..., Any] = get
+    return found
+
+
+def _setter(first: int) -> Callable[..., Any]:
+    """In compiled code ``put(array, index, row)``, the inverse of :func:`_getter`."""
+
+    @intrinsic
+    def put(_context: Any, array: Any, index: Any, row: Any) -> Any:
+        def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
+            places = _places(context, builder, signature.args[:2], *args[:2], first)
+            for i, kind in enumerate(row):
+                value = context.cast(builder, builder.extract_value(args[2], i), kind, array.dtype)
+                store_item(context, builder, array, value, next(places))
+            return context.get_dummy_value()
+
+        return types.void(array, index, row), generate
+
+    found: Callable[..., Any] = put
+    return found
+
+
 def reader(row: type[Any], first: int = 0) -> Callable[..., Any]:
     """Compiled ``read(array, robot, lane)``: a named tuple from ``array[first + field, robot, lane]``."""
-    fields = ", ".join(f"a[{first + i}, r, l]" for i in range(len(row._fields)))
-    scope: dict[str, Any] = {"Row": row}
-    exec(f"def read(a, r, l):\n    return Row({fields})\n", scope)
-    return law(scope["read"])
+    get = _getter(row, first)
+    return law(lambda array, robot, lane: get(array, (robot, lane)))
 
 
 def writer(row: type[Any], first: int = 0) -> Callable[..., Any]:
     """Compiled ``write(array, robot, lane, row)``, the inverse of :func:`reader`."""
-    lines = "\n".join(
-        f"    a[{first + i}, r, l] = row.{name}" for i, name in enumerate(row._fields)
-    )
-    scope: dict[str, Any] = {}
-    exec(f"def write(a, r, l, row):\n{lines}\n", scope)
-    return law(scope["write"])
+    put = _setter(first)
+    return law(lambda array, robot, lane, row: put(array, (robot, lane), row))
 
 
 def slot_reader(row: type[Any]) -> Callable[..., Any]:
     """Compiled ``read(ring, slot, robot, lane)`` that gathers a named tuple from a ring of them."""
-    fields = ", ".join(f"a[{i}, k, r, l]" for i in range(len(row._fields)))
-    scope: dict[str, Any] = {"Row": row}
-    exec(f"def read(a, k, r, l):\n    return Row({fields})\n", scope)
-    return law(scope["read"])
+    get = _getter(row, 0)
+    return law(lambda ring, slot, robot, lane: get(ring, (slot, robot, lane)))
 
 
 def slot_writer(row: type[Any]) -> Callable[..., Any]:
     """Compiled ``write(ring, slot, robot, lane, row)``, the inverse of :func:`slot_reader`."""
-    lines = "\n".join(f"    a[{i}, k, r, l] = row.{name}" for i, name in enumerate(row._fields))
-    scope: dict[str, Any] = {}
-    exec(f"def write(a, k, r, l, row):\n{lines}\n", scope)
-    return law(scope["write"])
+    put = _setter(0)
+    return law(lambda ring, slot, robot, lane, row: put(ring, (slot, robot, lane), row))
 
 
 def row_reader(row: type[Any], first: int) -> Callable[..., Any]:
     """Compiled ``read(tile, i)`` that gathers a named tuple from ``tile[first + field, i]``."""
-    fields = ", ".join(f"t[{first + i}, i]" for i in range(len(row._fields)))
-    scope: dict[str, Any] = {"Row": row}
-    exec(f"def read(t, i):\n    return Row({fields})\n", scope)
-    return law(scope["read"])
+    get = _getter(row, first)
+    return law(lambda tile, i: get(tile, (i,)))
 
 
 def row_writer(row: type[Any], first: int) -> Callable[..., Any]:
     """Compiled ``write(tile, i, row)``, the inverse of :func:`row_reader`."""
-    lines = "\n".join(f"    t[{first + i}, i] = row.{name}" for i, name in enumerate(row._fields))
-    scope: dict[str, Any] = {}
-    exec(f"def write(t, i, row):\n{lines}\n", scope)
-    return law(scope["write"])
+    put = _setter(first)
+    return law(lambda tile, i, row: put(tile, (i,), row))
