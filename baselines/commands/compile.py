@@ -60,7 +60,7 @@ def compile_before_first_run() -> None:
     folder = cache_folder()
     if folder is not None and any(folder.rglob("*control_step*.nbi")):
         return
-    notes.print("Compiling the step drivers, once on this machine: about a minute.")
+    notes.print("Compiling the step drivers, once on this machine: about half a minute.")
     if folder is not None:  # otherwise the run compiles them itself, and nothing is kept
         in_two_processes(USUAL)
 

@@ -48,7 +48,7 @@ def timed_step(arrays: Arrays, settings: Settings, spent: np.ndarray) -> None:
         acted = processor_time_us()
         advance(arrays, lanes[: end - begin], 0, settings.substeps, True, True, settings)
         advanced = processor_time_us()
-        transmit_all(arrays, begin, end, settings)
+        transmit_all(arrays, begin, end, arrays.states.shape[1], settings)
         transmitted = processor_time_us()
         look_all(arrays, begin, end, settings)
         looked = processor_time_us()

@@ -21,6 +21,7 @@ from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import STARTED
 from tlf_env.numerics.compiled import compile_for
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
+from tlf_env.numerics.pointers import Packed
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.start import Start, start_options
@@ -95,6 +96,8 @@ class BatchPlant:
         self._variants = make_variants(self.scenarios, _shares(mixture, len(self.scenarios)))
         each = [make_settings(one) for one in self.scenarios]
         self._settings = each[0]._replace(changing=any(one.changing for one in each))
+        self._packed = self._settings.packed()
+        self._packed_arrays = self.arrays.packed()
         self._seeded = np.zeros(self.formations, dtype=np.bool_)
         self._phases_s = np.zeros(1)  # of the tables of the leaders' references
         self._poses = NO_POSES  # start poses of the present episodes, if any are given
@@ -230,19 +233,21 @@ class BatchPlant:
     def _start(self, chosen: np.ndarray) -> None:
         arrays = self.arrays
         result, robot, lane = drivers.start(
-            arrays, self._variants, chosen, self._poses, self._settings
+            self._given(), self._variants, chosen, self._poses, self._packed
         )
         if result != STARTED:
             why = refusal(arrays, self._variants, result, robot, lane)
             raise ValueError(f"formation {lane}: {why}")
+        lanes = np.flatnonzero(chosen)
         drivers.control_step(
-            arrays,
-            np.flatnonzero(chosen),
-            self._nothing,
-            drivers.LOOK_AT_START,
-            0,
-            self._settings,
+            self._given(), lanes, self._nothing, drivers.LOOK_AT_START, 0, self._packed
         )
+
+    def _given(self) -> Packed:
+        """The arrays as drivers take them; packed again if others were put in their place."""
+        if self._packed_arrays.values is not self.arrays:
+            self._packed_arrays = self.arrays.packed()
+        return self._packed_arrays
 
     def compile_start(self) -> bool:
         """Compile the drivers of a reset, or load them from the cache; nothing is reset.
@@ -276,7 +281,7 @@ class BatchPlant:
 
     def write_excerpt(self, out: Excerpt, mask: np.ndarray | None = None) -> None:
         """Write the results of the formations of the mask; all if None."""
-        drivers.excerpt_of(self.arrays, self._checked_mask(mask), out)
+        drivers.excerpt_of(self._given(), self._checked_mask(mask), out)
 
     def reset_finished(self) -> np.ndarray:
         """Start the next episode wherever one ended in the last step; returns their mask."""
@@ -328,7 +333,7 @@ class BatchPlant:
         threads = min(self.threads, -(-self.formations // drivers.LANES_AT_ONCE))
         left = drivers.lanes_to_step(0, self.formations, threads)
         out = self._nothing if excerpt is None else excerpt
-        work = (arrays, left, out, drivers.WHOLE, 0, self._settings)
+        work = (self._given(), left, out, drivers.WHOLE, 0, self._packed)
         helpers = [self._others().submit(drivers.control_step, *work) for _ in range(threads - 1)]
         drivers.control_step(*work)
         for helper in helpers:

@@ -33,11 +33,15 @@ from tlf_env.engine.outside_base import make_base
 from tlf_env.engine.outside_parts import Parts, part_factories
 from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import IN_WALL, OFF_BASE, START_ATTEMPTS, STARTED
+from tlf_env.numerics.compiled import compile_for
+from tlf_env.numerics.pointers import Packed
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.parts import Factory, real_numbers
 from tlf_env.physics.chipmunk_plant import ChipmunkPlant
 from tlf_env.physics.pymunk_plant import (
+    NO_CAPSULES,
     NO_OBJECTS,
+    NO_OWNERS,
     OUT_OF_REACH,
     WITHIN_REACH,
     PymunkPlant,
@@ -107,6 +111,11 @@ class Formation:
         self._base = make_base(scenario, base)
         self._parts = Parts(part_factories(scenario, parts or {}), scenario)
         self._settings = make_settings(scenario)
+        self._packed = self._settings.packed()
+        # Settings of a step that goes substep by substep though no part is outside.
+        self._by_substep = self._settings._replace(has_parts=True).packed()
+        self._packed_arrays = self.arrays.packed()
+        self._compiled = False
         self._has_rays = scenario.rays is not None
         self._left = drivers.lanes_to_step(0, 1)
         self._nothing = empty_excerpt(self.arrays, 0, 0)
@@ -137,12 +146,14 @@ class Formation:
         ``start`` may replace the start poses of c, and start the leader's reference later on its
         trajectory.
         """
+        if not self._compiled:
+            self._compile()
         arrays, settings = self.arrays, self._settings
         arrays.clock[0], arrays.seeds[0] = (0, 0, episode, self.scenario.horizon_steps), seed
         phase_s = 0.0 if start.phases_s is None else float(start.phases_s[0])
         arrays.tables[0] = reference_table(self.scenario, phase_s) if phase_s else self._table
         poses = NO_POSES if start.poses is None else start.poses
-        result, robot, _ = drivers.start(arrays, self._variants, ALONE, poses, settings)
+        result, robot, _ = drivers.start(self._given(), self._variants, ALONE, poses, self._packed)
         if result != STARTED:
             raise ValueError(refusal(arrays, self._variants, result, robot))
         offsets_s = [
@@ -226,8 +237,10 @@ class Formation:
                 )
         self._left[0] = 0
         by_substep = objects == WITHIN_REACH and not settings.has_parts
-        given = settings._replace(has_parts=True) if by_substep else settings
-        result = drivers.control_step(arrays, self._left, self._nothing, drivers.WHOLE, 0, given)
+        given = self._by_substep if by_substep else self._packed
+        result = drivers.control_step(
+            self._given(), self._left, self._nothing, drivers.WHOLE, 0, given
+        )
         if objects == OUT_OF_REACH and result in (drivers.DONE, drivers.MUST_SUBSTEP):
             self.plant.advance_objects(arrays.rows("motion"), step, settings.substeps, settings.dt)
         if result == drivers.DONE:
@@ -252,9 +265,33 @@ class Formation:
         if self._has_rays:
             self._look_at_objects()
 
+    def _compile(self) -> None:
+        """Compile what an episode may need, or load it from the cache, so that none waits in its midst."""
+        arrays, settings, chosen = self._given(), self._packed, self._settings
+        nowhere = self._left, self._nothing
+        compile_for(drivers.start, arrays, self._variants, ALONE, NO_POSES, settings)
+        compile_for(drivers.control_step, arrays, *nowhere, drivers.WHOLE, 0, settings)
+        if chosen.collides:
+            compile_for(drivers.mark, arrays, 0, 0, 0)
+        if chosen.by_chipmunk:
+            compile_for(drivers.account, arrays, 0, settings)
+        if chosen.collides and self._has_rays:  # bodies may be put into the space at any time
+            compile_for(drivers.cast_at, arrays, 0, NO_CAPSULES, NO_OWNERS, settings)
+        if chosen.has_parts:
+            compile_for(drivers.delays_of, arrays, 0, 0, chosen.dt)
+            compile_for(drivers.delayed_message_of, arrays, 0, 0, 0, settings)
+        self._compiled = True
+
     def _do(self, part: int, number: int = 0) -> None:
         """A part of a control step; see :func:`~tlf_env.engine.drivers.control_step`."""
-        drivers.control_step(self.arrays, FIRST_LANE, self._nothing, part, number, self._settings)
+        packed = self._given()
+        drivers.control_step(packed, FIRST_LANE, self._nothing, part, number, self._packed)
+
+    def _given(self) -> Packed:
+        """The arrays as drivers take them; packed again if others were put in their place."""
+        if self._packed_arrays.values is not self.arrays:
+            self._packed_arrays = self.arrays.packed()
+        return self._packed_arrays
 
     def _look_at_objects(self) -> None:
         """Let the rays of the range sensors meet what only the space contains."""
@@ -263,7 +300,7 @@ class Formation:
             return
         capsules, owners = self.plant.visible(arrays.rows("motion"), step)
         if len(capsules):
-            drivers.cast_at(arrays, 0, capsules, owners, settings)
+            drivers.cast_at(self._given(), 0, capsules, owners, self._packed)
 
     def _substep_by_substep(self, close: bool) -> None:
         arrays, settings = self.arrays, self._settings
@@ -278,12 +315,12 @@ class Formation:
                 inputs, contact = arrays.inputs, arrays.rows("contact")
                 floors, pushes = inputs[FLOOR_INPUT:PUSH_INPUT], inputs[PUSH_INPUT:]
                 self.plant.advance(motion, contact, inputs[DELIVERED], floors, settings.dt, pushes)
-                drivers.account(arrays, 0, settings)
+                drivers.account(self._given(), 0, self._packed)
             elif close:
                 self.plant.collide(before, motion, settings.dt)
             self._do(drivers.SENSE, substep)
             for robot, body_type in self.plant.hits.items() if close else ():
-                drivers.mark(arrays, 0, robot, TOUCHED_BY[body_type])
+                drivers.mark(self._given(), 0, robot, TOUCHED_BY[body_type])
             self._parts.estimate(arrays, substep, settings)
         if close:
             arrays.calm[0] = 0  # a contact may have changed velocities at once

@@ -65,6 +65,7 @@ class Parts:
             "observer": scenario.control_period_s,
         }
         self._made: dict[str, list[Any]] = {}
+        self._packed: Any = None  # arrays and settings of the episode, for drivers
         self._radii = np.ones((len(self._robots), 2))  # of the wheels, believed over true
         self._holds: list[int] = []  # substeps for which the last command still holds
         self._odometry = self._moved = np.zeros((2, 0))  # (mm and rad, robot) in this control step
@@ -77,6 +78,7 @@ class Parts:
         ValueError
             for a factory that makes no part of its role.
         """
+        self._packed = arrays.packed(), settings.packed()
         belief = arrays.named("belief")
         self._radii = np.stack([belief.radius_l[:, 0], belief.radius_r[:, 0]], axis=1)
         robots = [
@@ -109,7 +111,7 @@ class Parts:
         for robot, loop in enumerate(self._of("wheel_loop")):
             if arrays.kinds[robot, 0] == TORQUE:
                 continue
-            _, hold = drivers.delays_of(arrays, 0, robot, settings.dt)
+            _, hold = drivers.delays_of(self._packed[0], 0, robot, settings.dt)
             row = "wanted_before" if substep < hold else "wanted"
             wanted = arrays.rows(row)[:, robot, 0].copy()
             sensors = arrays.named("sensors")
@@ -126,7 +128,7 @@ class Parts:
             return
         if substep == 0:
             self._holds = [
-                drivers.delays_of(arrays, 0, robot, settings.dt)[1]
+                drivers.delays_of(self._packed[0], 0, robot, settings.dt)[1]
                 for robot in range(len(estimators))
             ]
             self._odometry, self._moved = np.zeros((2, 2, len(estimators)))
@@ -176,7 +178,8 @@ class Parts:
             self._observe_one(arrays, settings, robot, int(arrays.clock[0, 1]) + settings.lookahead)
 
     def _observe_one(self, arrays: Arrays, settings: Settings, robot: int, step: int) -> None:
-        message = drivers.delayed_message_of(arrays, 0, robot, step, settings)
+        packed, numbers = self._packed
+        message = drivers.delayed_message_of(packed, 0, robot, step, numbers)
         reference = self._made["observer"][robot].update(message, step * settings.period)
         row = finite(reference, 5, f"robot_{robot}: the observer's update()")
         arrays.references[:, step % arrays.references.shape[1], robot, 0] = row

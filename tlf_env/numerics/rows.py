@@ -1,14 +1,13 @@
 """Compiled access to rows: named tuples of numbers, in arrays, rings and tiles.
 
-The fields of a row lie along the first axis of a C-contiguous array. One place is computed for all of them,
-as compiling an indexing for each would take most of the time that these functions take. Indices must not
-be negative.
+The fields of a row lie along the first axis of an array. One place is computed for all of them, as compiling
+an indexing for each would take most of the time that these functions take. Indices must not be negative.
 """
 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
 from numba.core import types
@@ -40,23 +39,33 @@ def replacing(row: type[Any], *names: str) -> Callable[..., Any]:
     return law(scope["replace"])
 
 
-def _places(context: Any, builder: Any, kinds: Any, array: Any, index: Any, first: int) -> Any:
+def _steps(context: Any, builder: Any, array_type: Any, made: Any) -> list[Any]:
+    """How many numbers lie between neighbours along each axis of an array."""
+    axes = range(array_type.ndim)
+    if array_type.layout != "C":
+        size = context.get_constant(types.intp, context.get_abi_sizeof(made.data.type.pointee))
+        return [builder.sdiv(builder.extract_value(made.strides, axis), size) for axis in axes]
+    steps = [context.get_constant(types.intp, 1)]
+    for axis in reversed(axes[1:]):  # from the shape, which the compiler may know
+        steps.append(builder.mul(steps[-1], builder.extract_value(made.shape, axis)))
+    return steps[::-1]
+
+
+def _places(
+    context: Any, builder: Any, kinds: Any, array: Any, index: Any, first: int
+) -> Iterator[Any]:
     """Pointers to the fields of a row at an index of the axes after the first, from field ``first`` on."""
     array_type, index_type = kinds
-    if array_type.layout != "C":
-        raise TypeError(f"rows need a C-contiguous array, got {array_type}")
     made = make_array(array_type)(context, builder, array)
-    shape = [builder.extract_value(made.shape, axis) for axis in range(array_type.ndim)]
-    place, size = context.get_constant(types.intp, 0), context.get_constant(types.intp, 1)
-    for axis, length in enumerate(shape[1:]):
-        one = context.cast(
-            builder, builder.extract_value(index, axis), index_type[axis], types.intp
-        )
-        place = builder.add(builder.mul(place, length), one)
-        size = builder.mul(size, length)
+    field_step, *steps = _steps(context, builder, array_type, made)
+    place = context.get_constant(types.intp, 0)
+    for axis, step in enumerate(steps):
+        part = builder.extract_value(index, axis)
+        part = context.cast(builder, part, index_type[axis], types.intp)
+        place = builder.add(place, builder.mul(part, step))
     for field in itertools.count(first):
-        offset = builder.mul(context.get_constant(types.intp, field), size)
-        yield builder.gep(made.data, [builder.add(offset, place)])
+        offset = builder.mul(context.get_constant(types.intp, field), field_step)
+        yield builder.gep(made.data, [builder.add(place, offset)])
 
 
 def _getter(row: type[Any], first: int) -> Callable[..., Any]:

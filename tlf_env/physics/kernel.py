@@ -113,7 +113,7 @@ def roll(
     return rolls and floor.creep == 0.0, moved(motion, frame, after, dt), impulses
 
 
-@block
+@law
 def slide(
     body: Body,
     motion: Motion,

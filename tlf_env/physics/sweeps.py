@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from tlf_env.numerics.compiled import block, law
+from tlf_env.numerics.compiled import law
 from tlf_env.physics.friction import disc
 from tlf_env.physics.friction_limits import FrictionLimits
 from tlf_env.physics.parameters import Body
@@ -192,7 +192,7 @@ def tyre_slips(body: Body, rates: Rates, floor: Floor, cos_p: float, sin_p: floa
     )
 
 
-@block
+@law
 def sweep(
     body: Body,
     free: Rates,
