@@ -273,8 +273,11 @@ class Formation:
         compile_for(drivers.control_step, arrays, *nowhere, drivers.WHOLE, 0, settings)
         if chosen.collides:
             compile_for(drivers.mark, arrays, 0, 0, 0)
-        if chosen.by_chipmunk:
+        if isinstance(self.plant, ChipmunkPlant):
             compile_for(drivers.account, arrays, 0, settings)
+            rows, inputs = self.arrays.rows, self.arrays.inputs
+            floors = inputs[FLOOR_INPUT:PUSH_INPUT]
+            self.plant.compile(rows("motion"), rows("contact"), floors, chosen.dt)
         if chosen.collides and self._has_rays:  # bodies may be put into the space at any time
             compile_for(drivers.cast_at, arrays, 0, NO_CAPSULES, NO_OWNERS, settings)
         if chosen.has_parts:

@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 import pymunk
 
-from tlf_env.numerics.compiled import driver, law
+from tlf_env.numerics.compiled import compile_for, driver, law
 from tlf_env.numerics.rows import reader
 from tlf_env.numerics.trig import sincos
 from tlf_env.physics.friction import disc
@@ -485,6 +485,14 @@ class ChipmunkPlant(PymunkPlant):
             forces[robot.chassis] = ((held_x + f_x, held_y + f_y), held + turning)
         self._forces = [(body, *both) for body, both in forces.items()]
         self._pushing = bool(pushes.any())
+
+    def compile(
+        self, motions: np.ndarray, contacts: np.ndarray, floors: np.ndarray, dt: float
+    ) -> None:
+        """Compile the drivers of a substep, or load them; the arguments as in :meth:`advance`."""
+        bodies, wheels = self._constants[:, :, None], np.zeros((2, len(self._robots)))
+        compile_for(set_limits, bodies, motions, contacts, floors, wheels, self._limits, dt)
+        compile_for(record, bodies, motions, contacts, floors, wheels, self._impulses, dt)
 
     def _limit(
         self,
