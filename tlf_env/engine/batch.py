@@ -21,7 +21,7 @@ from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import STARTED
 from tlf_env.numerics.compiled import compile_for
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
-from tlf_env.numerics.pointers import Packed
+from tlf_env.numerics.pointers import packed
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.start import Start, start_options
@@ -96,8 +96,8 @@ class BatchPlant:
         self._variants = make_variants(self.scenarios, _shares(mixture, len(self.scenarios)))
         each = [make_settings(one) for one in self.scenarios]
         self._settings = each[0]._replace(changing=any(one.changing for one in each))
-        self._packed = self._settings.packed()
-        self._packed_arrays = self.arrays.packed()
+        self._packed = packed(self._settings)
+        self._packed_arrays, self._packed_of = packed(self.arrays), self.arrays
         self._seeded = np.zeros(self.formations, dtype=np.bool_)
         self._phases_s = np.zeros(1)  # of the tables of the leaders' references
         self._poses = NO_POSES  # start poses of the present episodes, if any are given
@@ -243,10 +243,10 @@ class BatchPlant:
             self._given(), lanes, self._nothing, drivers.LOOK_AT_START, 0, self._packed
         )
 
-    def _given(self) -> Packed:
+    def _given(self) -> Arrays:
         """The arrays as drivers take them; packed again if others were put in their place."""
-        if self._packed_arrays.values is not self.arrays:
-            self._packed_arrays = self.arrays.packed()
+        if self._packed_of is not self.arrays:
+            self._packed_arrays, self._packed_of = packed(self.arrays), self.arrays
         return self._packed_arrays
 
     def compile_start(self) -> bool:

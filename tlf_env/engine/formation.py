@@ -34,7 +34,7 @@ from tlf_env.engine.outside_parts import Parts, part_factories
 from tlf_env.engine.settings import make_settings
 from tlf_env.engine.starting import IN_WALL, OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.numerics.compiled import compile_for
-from tlf_env.numerics.pointers import Packed
+from tlf_env.numerics.pointers import packed
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.parts import Factory, real_numbers
 from tlf_env.physics.chipmunk_plant import ChipmunkPlant
@@ -111,10 +111,10 @@ class Formation:
         self._base = make_base(scenario, base)
         self._parts = Parts(part_factories(scenario, parts or {}), scenario)
         self._settings = make_settings(scenario)
-        self._packed = self._settings.packed()
+        self._packed = packed(self._settings)
         # Settings of a step that goes substep by substep though no part is outside.
-        self._by_substep = self._settings._replace(has_parts=True).packed()
-        self._packed_arrays = self.arrays.packed()
+        self._by_substep = packed(self._settings._replace(has_parts=True))
+        self._packed_arrays, self._packed_of = packed(self.arrays), self.arrays
         self._compiled = False
         self._has_rays = scenario.rays is not None
         self._left = drivers.lanes_to_step(0, 1)
@@ -287,13 +287,13 @@ class Formation:
 
     def _do(self, part: int, number: int = 0) -> None:
         """A part of a control step; see :func:`~tlf_env.engine.drivers.control_step`."""
-        packed = self._given()
-        drivers.control_step(packed, FIRST_LANE, self._nothing, part, number, self._packed)
+        arrays = self._given()
+        drivers.control_step(arrays, FIRST_LANE, self._nothing, part, number, self._packed)
 
-    def _given(self) -> Packed:
+    def _given(self) -> Arrays:
         """The arrays as drivers take them; packed again if others were put in their place."""
-        if self._packed_arrays.values is not self.arrays:
-            self._packed_arrays = self.arrays.packed()
+        if self._packed_of is not self.arrays:
+            self._packed_arrays, self._packed_of = packed(self.arrays), self.arrays
         return self._packed_arrays
 
     def _look_at_objects(self) -> None:

@@ -11,6 +11,7 @@ from tlf_env.engine import drivers
 from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.layout import Sample, Trace
 from tlf_env.engine.settings import Settings
+from tlf_env.numerics.pointers import packed
 from tlf_env.onboard.parts import (
     Factory,
     Readings,
@@ -78,7 +79,7 @@ class Parts:
         ValueError
             for a factory that makes no part of its role.
         """
-        self._packed = arrays.packed(), settings.packed()
+        self._packed = packed(arrays), packed(settings)
         belief = arrays.named("belief")
         self._radii = np.stack([belief.radius_l[:, 0], belief.radius_r[:, 0]], axis=1)
         robots = [
@@ -178,8 +179,8 @@ class Parts:
             self._observe_one(arrays, settings, robot, int(arrays.clock[0, 1]) + settings.lookahead)
 
     def _observe_one(self, arrays: Arrays, settings: Settings, robot: int, step: int) -> None:
-        packed, numbers = self._packed
-        message = drivers.delayed_message_of(packed, 0, robot, step, numbers)
+        given, numbers = self._packed
+        message = drivers.delayed_message_of(given, 0, robot, step, numbers)
         reference = self._made["observer"][robot].update(message, step * settings.period)
         row = finite(reference, 5, f"robot_{robot}: the observer's update()")
         arrays.references[:, step % arrays.references.shape[1], robot, 0] = row

@@ -43,6 +43,7 @@ from numba.core.compiler_lock import global_compiler_lock
 from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering, NopythonRewrites
+from numba.core.types.misc import unliteral
 from numba.core.untyped_passes import (
     FindLiterallyCalls,
     InlineClosureLikes,
@@ -385,8 +386,8 @@ class _Inner(CPUDispatcher):
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """What a call has: a constant argument is one of its type, not a function of its own."""
-        plain = {name: types.unliteral(one) for name, one in kws.items()}
-        return super().get_call_template(tuple(types.unliteral(one) for one in args), plain)
+        plain = {name: unliteral(one) for name, one in kws.items()}
+        return super().get_call_template(tuple(unliteral(one) for one in args), plain)
 
     def _insert(self, *_: Any) -> None:
         """Keep what was compiled from Python, which could not call it."""

@@ -4,7 +4,7 @@ Numba passes a named tuple field by field, and an array as ten numbers and more,
 tuple of forty arrays has hundreds of arguments: most of what is compiled would be their copying. Here the
 numbers lie in memory, and compiled functions read what they need. Nothing writes there again, which the
 compiler is told, so that it reads a number once before a loop. Whoever calls a driver often keeps what
-:meth:`~Packed.packed` returns, and gives that: then a call costs no time for the fields.
+:func:`packed` returns, and gives that: then a call costs no time for the fields.
 """
 
 from __future__ import annotations
@@ -19,10 +19,12 @@ import numba
 from llvmlite import ir
 from numba.core import cgutils, types
 from numba.core.imputils import impl_ret_borrowed, lower_getattr_generic
+from numba.core.types.containers import BaseTuple
 from numba.core.typing.templates import AttributeTemplate, infer_getattr
 from numba.extending import NativeValue, models, register_model, typeof_impl, unbox
 
 T = TypeVar("T", bound=type)
+V = TypeVar("V")
 
 SLOT_BYTES = 8  # each number has a place of its own, wide enough for any
 BYTES = ir.IntType(8).as_pointer()
@@ -79,13 +81,20 @@ class Packed:
         return Packed, (self.values,)  # a copy has addresses of its own
 
 
+def packed(values: V) -> V:
+    """A named tuple for drivers: what they would make of it at every call, for as long as its arrays stay."""
+    given: Any = values if numba.config.DISABLE_JIT else Packed(values)
+    found: V = given
+    return found
+
+
 def _words(value: Any, kind: types.Type) -> Iterator[int]:
     """A value as Numba lays it out, each number in a word of 64 bits."""
     if isinstance(kind, types.Array):
         nobody = (0, 0)  # no owner that compiled code would count references to
         yield from (*nobody, value.size, value.itemsize, value.ctypes.data)
         yield from (*value.shape, *value.strides)
-    elif isinstance(kind, types.BaseTuple):
+    elif isinstance(kind, BaseTuple):
         for one, part in zip(value, kind, strict=True):
             yield from _words(one, part)
     elif isinstance(kind, types.Float):

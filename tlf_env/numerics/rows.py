@@ -11,6 +11,7 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 from numba.core import types
+from numba.core.types.containers import BaseTuple
 from numba.extending import intrinsic
 from numba.np.arrayobj import load_item, make_array, store_item
 
@@ -73,10 +74,10 @@ def _getter(row: type[Any], first: int) -> Callable[..., Any]:
 
     @intrinsic
     def get(_context: Any, array: Any, index: Any) -> Any:
-        result = types.BaseTuple.from_types((array.dtype,) * len(row._fields), row)
+        result = BaseTuple.from_types((array.dtype,) * len(row._fields), row)
 
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            places = _places(context, builder, signature.args, *args, first)
+            places = _places(context, builder, signature.args, args[0], args[1], first)
             values = [load_item(context, builder, array, next(places)) for _ in row._fields]
             return context.make_tuple(builder, result, values)
 
@@ -92,7 +93,7 @@ def _setter(first: int) -> Callable[..., Any]:
     @intrinsic
     def put(_context: Any, array: Any, index: Any, row: Any) -> Any:
         def generate(context: Any, builder: Any, signature: Any, args: Any) -> Any:
-            places = _places(context, builder, signature.args[:2], *args[:2], first)
+            places = _places(context, builder, signature.args[:2], args[0], args[1], first)
             for i, kind in enumerate(row):
                 value = context.cast(builder, builder.extract_value(args[2], i), kind, array.dtype)
                 store_item(context, builder, array, value, next(places))
