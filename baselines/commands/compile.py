@@ -28,8 +28,8 @@ class Share(NamedTuple):
 # Optimising a driver as a whole takes about half as long as compiling the functions inside it.
 DRIVER_FOR_FUNCTION = 0.5
 # Each for two processes: what most runs need, and everything.
-USUAL = (Share("float32", ("step",), 517), Share("float32", ("start",), 180))
-ALL = (Share("float32", ("step", "start", "speed"), 590), Share("float64", ("step", "start"), 579))
+USUAL = (Share("float32", ("step",), 478), Share("float32", ("start",), 123))
+ALL = (Share("float32", ("step", "start", "speed"), 537), Share("float64", ("step", "start"), 524))
 
 
 def compile_drivers(shares: tuple[Share, ...] = USUAL) -> None:
