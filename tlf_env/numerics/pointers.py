@@ -2,9 +2,9 @@
 
 Numba passes a named tuple field by field, and an array as ten numbers and more, so that a function with a
 tuple of forty arrays has hundreds of arguments: most of what is compiled would be their copying. Here the
-numbers lie in memory, and compiled functions read what they need. Nothing writes there again, which the
-compiler is told, so that it reads a number once before a loop. Whoever calls a driver often keeps what
-:func:`packed` returns, and gives that: then a call costs no time for the fields.
+numbers lie in memory, and compiled functions read what they need. Nothing writes there again, and the
+reads are marked so, so that the compiler moves them to before a loop. A program that calls a driver often
+keeps what :func:`packed` returns, and gives that: then a call costs no time for the fields.
 """
 
 from __future__ import annotations
