@@ -1,9 +1,9 @@
-"""Policies from raw sensors to wheel speeds: the table of the section *Raw sensors* of ``docs/learning.md``.
+"""Policies from raw sensors to wheel speeds: table and figure of *Raw sensors* in ``docs/learning.md``.
 
 ``python docs/figures/make_sensors.py`` drives every policy of ``results/train/sensors`` (made by
 ``tlf train sensors --seeds 0,1,2``) on seeds that nothing was tuned on, keeps what it finds in
-``docs/learning/sensors.json`` by the digest of the policy's file, and makes the table; ``--kept`` makes it from
-that file alone. The nominal ∞ has 100 runs, the other columns 30.
+``docs/learning/sensors.json`` by the digest of the policy's file, and makes table and figure; ``--kept`` makes
+them from that file alone. The nominal ∞ has 100 runs, the other columns 30.
 """
 
 from __future__ import annotations
@@ -14,16 +14,20 @@ import json
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
-from make_algorithms import CELLS, drive
+from make_algorithms import CELLS, MILLION, Entry, draw_scores, drive
 from make_board import DOCS
+from make_figures import BLUE, STYLE
 from make_parts import put
 from make_speed import table
+from matplotlib.figure import Figure
 
 from baselines.runs.seed_ranges import FIRST_TABLE_SEED
 from tlf_env.common.files import atomic
 
 PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "sensors.json"
+PICTURE = DOCS / "learning" / "sensors.png"
 TRAINED = Path("results/train/sensors")
 DEFAULT = "reference:linearised"
 NOMINAL, NOMINAL_RUNS, RUNS = "∞, nominal", 100, 30
@@ -48,6 +52,7 @@ def of_training(folder: Path) -> dict[str, Any]:
     return {
         "imitated_mm": first["score_mm"],
         "ended_mm": last["score_mm"],
+        "course": [[one["robot_steps"], one["score_mm"]] for one in curve["evaluations"]],
         "kept_mm": kept["score_mm"],
         "kept_at": kept["robot_steps"],
         "minutes": curve["wall_time_s"] / 60,
@@ -82,6 +87,23 @@ def judged_table(kept: dict[str, Any]) -> str:
     return table(["", *CELLS, "imitation", "kept", "minutes"], rows)
 
 
+def draw(kept: dict[str, Any], path: Path) -> None:
+    """Draw the score while PPO goes on after the imitation: median and range of the training seeds."""
+    courses = np.array([one["training"]["course"] for one in kept.values() if "training" in one])
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(5.0, 3.2), layout="constrained")
+        panel = figure.subplots()
+        steps, scores = courses[0, :, 0], courses[:, :, 1]
+        draw_scores(panel, steps / MILLION, scores, Entry("sensors", "PPO, `sensors`", BLUE))
+        panel.set(
+            xlabel="robot steps of PPO after the imitation, millions",
+            ylabel="score on validation seeds, mm",
+        )
+        panel.set_ylim(bottom=0.0)
+        panel.legend(fontsize="small")
+        figure.savefig(path, dpi=110)
+
+
 def main() -> None:
     """Drive what is new, and make the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -105,6 +127,7 @@ def main() -> None:
                 with atomic(RESULTS, encoding="utf-8") as file:
                     json.dump(kept, file)
     put(PAGE, judged_table(kept), "sensors")
+    draw(kept, PICTURE)
 
 
 if __name__ == "__main__":
