@@ -1,8 +1,8 @@
 """Rollouts of one process and of the workers of a Ray cluster: the table of ``docs/scale.md``.
 
-``python docs/figures/make_scale.py`` needs the extras ``train`` and ``ray`` and takes about three minutes. Ray runs
-on this machine. All ways take turns; a round of each is :data:`STEPS` control steps with actions of a small
-deviation, as a learner's are, and times are medians of the rounds by the clock.
+``python docs/figures/make_scale.py`` needs the extras ``train`` and ``ray`` and takes about three minutes.
+Ray runs on this machine. All ways take turns; a round of each is :data:`STEPS` control steps with actions of a
+small deviation, as a learner's are, and times are medians of the rounds by the clock.
 """
 
 from __future__ import annotations

@@ -29,6 +29,7 @@ from tlf_env.common.files import atomic
 PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "sensors.json"
 PICTURE = DOCS / "learning" / "sensors.png"
 TRAINED = Path("results/train/sensors")
+BOARD, ON_BOARD = Path("results/board-sensors/leaderboard.json"), "seed_0"  # and whose it is
 DEFAULT = "reference:linearised"
 NOMINAL, NOMINAL_RUNS, RUNS = "∞, nominal", 100, 30
 
@@ -59,6 +60,13 @@ def of_training(folder: Path) -> dict[str, Any]:
     }
 
 
+def on_board(leaderboard: dict[str, Any]) -> dict[str, Any]:
+    """Score and failures of the policy on the benchmark's plan ``board``."""
+    (mine,) = leaderboard["policies"]
+    lost = {f"{one['task']}, {one['disturbance']}": one["lost"] for one in leaderboard["cells"]}
+    return {"score": mine["score"], "runs": mine["runs"], "failed": mine["failed"], "lost": lost}
+
+
 def shown(cell: dict[str, Any]) -> str:
     """Median of the runs that were held, and the failed ones in brackets."""
     first = FIRST_TABLE_SEED
@@ -66,6 +74,12 @@ def shown(cell: dict[str, Any]) -> str:
     lost = len(cell["failed"])
     median = f"{np.median(held):.2f}" if held else "–"
     return f"{median} ({lost})" if lost else median
+
+
+def keep(found: dict[str, Any]) -> None:
+    """Write what was found."""
+    with atomic(RESULTS, encoding="utf-8") as file:
+        json.dump(found, file)
 
 
 def judged_table(kept: dict[str, Any]) -> str:
@@ -119,13 +133,12 @@ def main() -> None:
             path = folder / "policy.safetensors"
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             if kept.get(folder.name, {}).get("digest") != digest:
-                kept[folder.name] = {
-                    "digest": digest,
-                    "training": of_training(folder),
-                    "cells": judged(str(path)),
-                }
-                with atomic(RESULTS, encoding="utf-8") as file:
-                    json.dump(kept, file)
+                kept[folder.name] = {"digest": digest, "cells": judged(str(path))}
+            kept[folder.name]["training"] = of_training(folder)
+            keep(kept)
+        if BOARD.is_file():
+            kept[ON_BOARD]["board"] = on_board(json.loads(BOARD.read_text(encoding="utf-8")))
+            keep(kept)
     put(PAGE, judged_table(kept), "sensors")
     draw(kept, PICTURE)
 
