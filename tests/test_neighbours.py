@@ -134,8 +134,15 @@ def test_tasks_with_different_gaps_are_refused():
         )
 
 
-@pytest.mark.parametrize("relayed", [False, True])
-def test_a_correction_is_the_predecessors_error_of_one_gap_ago(relayed):
+@pytest.mark.parametrize(
+    "weights",
+    [
+        arms.OWN_ERROR,
+        arms.CORRECTED_ERROR,
+        arms.Weights(sent=(0.5, -0.2), relayed=(0.9, 0.3), applied=(1.2, 0.7)),
+    ],
+)
+def test_a_correction_is_what_the_predecessor_sent_one_gap_ago(weights):
     scenario = arms.RowVecEnv("infinity", 1, arm=arms.Arm("own"), robots=ROBOTS, **SHORT).plants[0]
     scenario = scenario.scenario
     names = arms.entry_names(scenario)
@@ -145,7 +152,7 @@ def test_a_correction_is_the_predecessors_error_of_one_gap_ago(relayed):
         seen.append(rows.copy())
         return np.zeros((len(rows), 2)), None
 
-    policy = arms.CorrectingPolicy(SimpleNamespace(predict=predict), scenario, relayed)
+    policy = arms.CorrectingPolicy(SimpleNamespace(predict=predict), scenario, weights)
     generator = np.random.default_rng(0)
     rows = generator.normal(size=(3 * GAP, 2 * ROBOTS, len(names))).astype(np.float32)
     places = [names.index(name) for name in ("e_1", "e_2")]
@@ -154,14 +161,17 @@ def test_a_correction_is_the_predecessors_error_of_one_gap_ago(relayed):
     for one in rows:
         _, state = policy.predict(one, state, start)
         start[:] = False
-    sent_mm = (np.array(seen) if relayed else rows)[:, :, places] * 500
+    sent_mm = np.zeros((3 * GAP, 2 * ROBOTS, 2))
     for step in range(3 * GAP):
         heard = ahead(sent_mm[step - GAP]) if step >= GAP else np.zeros((2 * ROBOTS, 2))
         heard = np.clip(heard, -arms.MOST_MM, arms.MOST_MM)
+        own = rows[step][:, places] * 500
+        sent_mm[step] = np.array(weights.sent) * own + np.array(weights.relayed) * heard
         wanted = rows[step].copy()
         for kind, scale in (("", 500), ("_fine", 10)):
             for i in (1, 2):
-                wanted[:, names.index(f"e_{i}{kind}")] += heard[:, i - 1] / scale
+                added = weights.applied[i - 1] * heard[:, i - 1]
+                wanted[:, names.index(f"e_{i}{kind}")] += added / scale
         np.testing.assert_allclose(seen[step], wanted, rtol=1e-4, atol=1e-4)
     assert (np.abs(sent_mm) > 0.1).any()
 
