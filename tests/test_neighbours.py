@@ -208,7 +208,7 @@ def test_the_tables_are_those_of_the_kept_runs():
 
 
 def test_every_arm_has_three_trainings_and_the_same_runs():
-    for arm in ("own", "heard", "shared"):
+    for arm in ("learned", "own", "heard", "shared"):
         for cell in script.CELLS:
             mine = script.of(ROWS, cell.name, arm)
             assert [row["seed"] for row in mine] == [0, 1, 2]
@@ -265,6 +265,24 @@ def test_what_the_messages_gain_and_cost():
         only = script.of(ROWS, slip, arm)[0]
         assert sum(only["failed"]) == 1
         assert only["row_mm"][only["failed"].index(1)][-1] == pytest.approx(240, abs=5)
+
+
+def test_the_learned_message_is_the_relayed_one():
+    searches = [row for row in ROWS if row["cell"] == "training" and row["arm"] == "learned"]
+    assert [row["seed"] for row in searches] == [0, 1, 2]
+    weights = [value for row in searches for value in row["weights"]]
+    assert f"at weights of {min(weights):.2f} to {max(weights):.2f}" in TEXT
+    for row in searches:
+        assert len(row["score_mm"]) == script.TRIALS == 60
+        assert row["score_mm"][-1] < 0.6 * row["score_mm"][0]
+    for cell in NAMES:
+        assert apart(cell, "learned", "base", PATH).high < 0
+        found = apart(cell, "learned", "relayed", PATH)
+        assert found.low < 0 < found.high
+        assert abs(found.median) < (0.1 if cell in NAMES[:2] else 0.3)
+    runs = [row for row in ROWS if row["arm"] == "learned" and "failed" in row]
+    lost = [one for row in runs for one in row["failed"]]
+    assert (len(lost), sum(lost)) == (210, 0)
 
 
 def test_all_that_the_predecessor_observes_gains_nothing_clear():

@@ -63,7 +63,9 @@ def of_training(folder: Path) -> dict[str, Any]:
 def on_board(leaderboard: dict[str, Any]) -> dict[str, Any]:
     """Score and failures of the policy on the benchmark's plan ``board``."""
     (mine,) = leaderboard["policies"]
-    lost = {f"{one['task']}, {one['disturbance']}": one["lost"] for one in leaderboard["cells"]}
+    lost = {
+        f"{one['task']}, {one['disturbance']}": one["lost"]["count"] for one in leaderboard["cells"]
+    }
     return {"score": mine["score"], "runs": mine["runs"], "failed": mine["failed"], "lost": lost}
 
 
