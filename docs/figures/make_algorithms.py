@@ -256,11 +256,13 @@ def draw(rows: Sequence[Row], path: Path) -> None:
         figure.savefig(path, dpi=110)
 
 
-def draw_scores(panel: Axes, along: np.ndarray, scores: np.ndarray, entry: Entry) -> None:
+def draw_scores(
+    panel: Axes, along: np.ndarray, scores: np.ndarray, entry: Entry, marker: str = "."
+) -> None:
     """Draw the scores of an entry's training seeds ``(seed, evaluation)``: median and range."""
     label = f"{entry.label.replace('`', '')}, {len(scores)} seed{'s' * (len(scores) > 1)}"
     panel.plot(
-        along, np.median(scores, axis=0), entry.line, color=entry.colour, label=label, marker="."
+        along, np.median(scores, axis=0), entry.line, color=entry.colour, label=label, marker=marker
     )
     panel.fill_between(
         along, scores.min(axis=0), scores.max(axis=0), color=entry.colour, alpha=0.2, lw=0

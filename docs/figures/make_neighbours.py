@@ -10,6 +10,7 @@ searches the weights of a message with Optuna, which needs the extra ``tune``.
 ``probe`` fits networks that estimate a follower's error half a second later from what it sees in an arm.
 
 ``judge`` runs what was trained on seeds that nothing was tuned on; with ``--only ARM`` one arm alone.
+``courses`` keeps the courses of the trainings without judging them again.
 """
 
 from __future__ import annotations
@@ -25,7 +26,9 @@ import numpy as np
 import torch
 from generalisation_kick import SLIPPING, displacements_mm, row_scenario
 from generalisation_runs import along_row
+from make_algorithms import MILLION, Entry
 from make_board import DOCS
+from make_figures import BLUE, GREY, ORANGE
 from make_memory import difference, explained
 from make_parts import put
 from make_speed import table
@@ -45,6 +48,7 @@ from neighbours_arms import (
     leaders_of,
 )
 from stable_baselines3 import PPO
+from training_courses import Course, courses_of, draw_courses
 
 from baselines.data.episodes import entry_names
 from baselines.policies.registry import fit_policy
@@ -60,9 +64,14 @@ from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario
 
 PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "neighbours.json"
-PICTURE = RESULTS.with_suffix(".png")
+PICTURE, COURSES = RESULTS.with_suffix(".png"), RESULTS.with_name("neighbours-courses.png")
+COURSES_DRAWN = (
+    Entry("own", "own", GREY, "-"),
+    Entry("heard", "heard", BLUE, "--"),
+    Entry("shared", "shared", ORANGE, "-."),
+)
 TRAINED = Path("results/neighbours")
-MODEL_FILE, ABOUT_FILE = "policy.zip", "about.json"
+MODEL_FILE = "policy.zip"
 ROW = 5  # robots of a training; with six or more, robots of the ∞ meet at its crossing
 FAR = {"range_mm": 5000.0}  # the largest range: a neighbour is always heard
 ROBOT_STEPS, FORMATIONS = 1_000_000, 32
@@ -137,17 +146,17 @@ def train_arm(name: str, seeds: Sequence[int], trained: Path) -> None:
     for seed in seeds:
         folder = trained / name / f"seed_{seed}"
         folder.mkdir(parents=True, exist_ok=True)
-        began_s = time.process_time()
         envs = RowVecEnv(tasks, config.formations, arm=arm, mixture=shares, infos=False)
         model = make_model(config, envs, seed)
         spread_out(model, envs, config.seeds[0])
+        course = Course()
         while model.num_timesteps < config.robot_steps:
             set_learning_rate(model, config)
             model.learn(rollout_steps(model), reset_num_timesteps=False, log_interval=None)
+            course.note(model.num_timesteps, float(model.rollout_buffer.rewards.mean()))
         model.save(folder / MODEL_FILE)
-        about = {"minutes": round((time.process_time() - began_s) / 60, 2)}
-        (folder / ABOUT_FILE).write_text(json.dumps(about) + "\n", encoding="utf-8")
-        print(name, seed, about, envs.end_shares(), flush=True)
+        course.keep(folder)
+        print(name, seed, envs.end_shares(), flush=True)
 
 
 def scenario_of(cell: Cell) -> Scenario:
@@ -276,9 +285,15 @@ def judge_arm(name: str, seeds: Sequence[int], trained: Path) -> list[dict[str, 
             scenario = row_scenario(**config_of(arm).scenario)
             moved = kicked(RowPolicy(model, arm, scenario), scenario)
             rows.append({"cell": "kick", **about, "moved_mm": moved})
-        minutes = json.loads((folder / ABOUT_FILE).read_text("utf-8"))["minutes"]
-        rows.append({"cell": "training", **about, "minutes": minutes})
-    return rows
+    return rows + trainings(name, trained)
+
+
+def trainings(name: str, trained: Path) -> list[dict[str, Any]]:
+    """The courses of an arm's trainings, a row for each."""
+    return [
+        {"cell": "training", **one, "seed": int(one["seed"].removeprefix("seed_"))}
+        for one in courses_of(trained / name, name)
+    ]
 
 
 def joined(rows: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -529,7 +544,7 @@ def main() -> None:
     """Make what is asked for, and write tables and figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "what", nargs="*", help="train ARM; judge; probe; nothing: tables and figure alone"
+        "what", nargs="*", help="train ARM; judge; courses; probe; nothing: tables and figures"
     )
     parser.add_argument("--seeds", default="0,1,2", help="of the trainings")
     parser.add_argument("--only", choices=(*LAWS, *ARMS), help="judge one arm, and keep the others")
@@ -550,16 +565,29 @@ def main() -> None:
             for name in (given.only,) if given.only else every:
                 rows = joined(rows, judge_arm(name, seeds, given.trained))
                 keep(rows)
+        case ["courses"]:
+            kept = [row for row in rows if row["cell"] != "training" or row["arm"] not in ARMS]
+            rows = kept + [one for name in ARMS for one in trainings(name, given.trained)]
+            keep(rows)
         case ["probe"]:
             rows = joined(rows, probe())
             keep(rows)
         case []:
             pass
         case _:
-            parser.error(f"{' '.join(given.what)!r} is none of train ARM, judge, probe")
+            parser.error(f"{' '.join(given.what)!r} is none of train ARM, judge, courses, probe")
     for name, text in tables(rows).items():
         put(PAGE, text, name)
     draw(rows, PICTURE)
+    courses = [row for row in rows if row["cell"] == "training" and "along" in row]
+    draw_courses(
+        courses,
+        COURSES_DRAWN,
+        COURSES,
+        along="robot steps, millions",
+        values="mean reward of a rollout",
+        scale=MILLION,
+    )
 
 
 if __name__ == "__main__":
