@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import hashlib
 import json
 import os
@@ -302,6 +303,22 @@ def test_the_moment_is_seen_again(courses):
     for agent in env.possible_agents:
         assert observations[agent].tobytes() == seen[agent].tobytes()
         assert [*again[agent].items()] == [*infos[agent].items()]
+
+
+def test_what_is_known_to_be_out_of_reach_stays_so_in_snapshots_and_copies():
+    far = {"pushables": [thing(9000.0, 9000.0, True)]}
+    env, other = (tlf_env.parallel_env("infinity", world=far) for _ in range(2))
+    env.reset(seed=0)
+    for _ in range(3):
+        env.step({agent: np.zeros(2) for agent in env.agents})
+    plant = env.formation.plant
+    assert plant._is_calm()
+    other.set_state(env.get_state())
+    for twin in (other, copy.deepcopy(env), pickle.loads(pickle.dumps(env))):
+        assert twin.formation.plant._is_calm()
+        assert twin.formation.plant._calm_until == plant._calm_until
+        twin.pushable_bodies[0].position = (500.0, 0.0)
+        assert not twin.formation.plant._is_calm()
 
 
 def test_branches_of_one_moment(courses):
@@ -1365,15 +1382,15 @@ def test_a_snapshot_does_not_change_and_cannot_be_changed():
     env = tlf_env.parallel_env("infinity", disturbance="noise")
     env.reset(seed=0)
     taken = env.get_state()
-    copy = pickle.loads(pickle.dumps(taken))
+    twin = pickle.loads(pickle.dumps(taken))
     env.step({agent: np.ones(2) for agent in env.agents})
-    assert taken == copy
+    assert taken == twin
     assert taken != env.get_state()
     assert taken.kind == "FormationParallelEnv"
     assert taken.nbytes == sum(array.nbytes for array in taken.numbers.values()) > 1000
     assert repr(taken) == f"<Snapshot of a FormationParallelEnv, {taken.nbytes} bytes>"
     assert taken != 3
-    for array in [*taken.numbers.values(), *copy.numbers.values()]:
+    for array in [*taken.numbers.values(), *twin.numbers.values()]:
         assert not array.flags.writeable
 
 

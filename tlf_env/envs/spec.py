@@ -273,8 +273,8 @@ while env.agents:
   generators of the spaces, the counters of wrappers (`TimeLimit`, the AEC conversion), and functions that you
   give to bodies, constraints or collisions.
 - Objects that you have added to the space go back, too. They must be there in the same order, with the same
-  sizes and masses. (The order of contacts with several walls at once may differ after a wall was removed
-  within an episode.)
+  sizes and masses. (After a wall was removed or moved within an episode, the order in which contacts with
+  several walls at once are solved may differ.)
 - A snapshot that does not fit is refused with one line that names the first difference, and nothing changes.
   A file is refused if it is damaged, or if it was written by other code of tlf_env or with another version of
   Numba or pymunk, as its future would be another. Nothing in a file is pickled, and loading it runs no code.

@@ -579,6 +579,10 @@ class PymunkPlant:
             body._position_func = None  # pymunk before 7.3.1 keeps the last one, and copies it
         self._corrections = []
 
+    def _is_calm(self) -> bool:
+        """Whether nothing has been stirred since objects were found to be out of reach."""
+        return self._calm_until > 0 and self._stir() == self._calm
+
     def _take_corrections(self) -> None:
         """Take the corrections of the next step from the bodies; that step adds them itself."""
         if not self._corrections:
@@ -617,7 +621,6 @@ class PymunkPlant:
         none = Correction(0.0, 0.0, 0.0)
         corrections = dict(self._corrections)
         rests = [self._rests.get(body) for body in bodies]
-        calm = self._calm_until > 0 and self._stir() == self._calm
         return {
             "bodies": np.array([body_row(body) for body in bodies]),
             "corrections": np.array([corrections.get(body, none) for body in bodies]),
@@ -629,7 +632,7 @@ class PymunkPlant:
             "moved": np.array(
                 [[i in some for i in robots] for some in (self._moved, self._moved_before)]
             ),
-            "calm": np.array([self._calm_until, calm], dtype=np.int64),
+            "calm": np.array([self._calm_until, self._is_calm()], dtype=np.int64),
         }
 
     def check_state(self, state: Mapping[str, np.ndarray]) -> None:
@@ -676,7 +679,7 @@ class PymunkPlant:
         return {
             **self.__dict__,
             "_buffer": None,
-            "_calm": (),
+            "_calm": self._is_calm(),
             "_sizes": {},
             "_borders": None,
             "_bordered": ([], []),
@@ -684,6 +687,7 @@ class PymunkPlant:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _buffer=Buffer())
+        self._calm = self._stir() if state["_calm"] else ()
 
 
 def half_thickness(body: pymunk.Body) -> float:
