@@ -266,7 +266,8 @@ while env.agents:
 
 - `FormationParallelEnv`, `FormationEnv` (`gymnasium.make(...).unwrapped`), `FormationVectorEnv`, `BatchPlant`
   and `Formation` have both methods, on every plant. A snapshot goes back into an object of the same class
-  that was made with the same arguments; threads, render mode and `infos` may differ.
+  that was made with the same arguments; threads, render mode and `infos` may differ. (Gymnasium's wrappers
+  want a `reset` before the first `step`, too.)
 - In it are all states of the engine and of the space (motions, delays, estimators, random processes, contacts
   with the impulses that they remember, pushed and moving bodies), seed and number of the episode,
   `np_random`, and the states of [parts and policies of yours](parts.md#snapshots). Not in it are the random
