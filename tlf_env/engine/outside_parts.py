@@ -9,8 +9,10 @@ import numpy as np
 
 from tlf_env.engine import drivers
 from tlf_env.engine.arrays import Arrays
-from tlf_env.engine.layout import Sample, Trace
+from tlf_env.engine.layout import Sample, Trace, rows_of
 from tlf_env.engine.settings import Settings
+from tlf_env.onboard.calibration import Belief
+from tlf_env.onboard.memory import give_state, state_of
 from tlf_env.onboard.parts import (
     Factory,
     Readings,
@@ -25,6 +27,8 @@ from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.scenario import Scenario
 
+AXLE = Belief._fields.index("h")
+RADII = [Belief._fields.index(name) for name in ("radius_l", "radius_r")]
 COVARIANCE = np.triu_indices(3)  # its order in an Estimate, after the pose
 SLIP = [SlipEstimate._fields.index(name) for name in ("delta_1", "delta_2")]
 ODOMETRY = [Trace._fields.index(name) for name in ("distance", "turn")]
@@ -77,29 +81,90 @@ class Parts:
         ValueError
             for a factory that makes no part of its role.
         """
-        belief = arrays.named("belief")
-        self._radii = np.stack([belief.radius_l[:, 0], belief.radius_r[:, 0]], axis=1)
+        self._radii, self._made = self._started(arrays.constants, arrays.states)
+        for robot in range(1, len(self._of("observer"))):
+            for step in range(settings.lookahead + 1):
+                self._observe_one(arrays, settings, robot, step)
+
+    def _started(
+        self, constants: np.ndarray, states: np.ndarray
+    ) -> tuple[np.ndarray, dict[str, list[Any]]]:
+        """Wheel radii, and new parts at the start of the episode with these rows of the engine's arrays."""
+        belief, starts = (
+            rows_of(array, name)[:, :, 0]
+            for array, name in ((constants, "belief"), (states, "start"))
+        )
         robots = [
-            with_axle_width(robot, 2.0 * float(h))
-            for robot, h in zip(self._robots, belief.h[:, 0], strict=True)
+            with_axle_width(robot, 2.0 * h)
+            for robot, h in zip(self._robots, belief[AXLE].tolist(), strict=True)
         ]
-        self._made = {
+        made = {
             role: [
                 make_part(role, self._names[role], factory, robot, self._periods[role])
                 for robot in robots
             ]
             for role, factory in self._factories.items()
         }
-        starts = arrays.rows("start")[:, :, 0]
-        for estimator, pose in zip(self._of("estimator"), starts.T, strict=False):
+        for estimator, pose in zip(made.get("estimator", []), starts.T, strict=False):
             estimator.reset(pose.copy())
-        for loop in self._of("wheel_loop"):
+        for loop in made.get("wheel_loop", []):
             loop.reset()
-        for robot, observer in enumerate(self._of("observer")):
-            if robot > 0:
-                observer.reset(starts[:, robot].copy())
-                for step in range(settings.lookahead + 1):
-                    self._observe_one(arrays, settings, robot, step)
+        for observer, pose in zip(made.get("observer", [])[1:], starts.T[1:], strict=False):
+            observer.reset(pose.copy())
+        return belief[RADII].T.copy(), made
+
+    def get_state(self, numbers: dict[str, np.ndarray]) -> Any:
+        """The states of all parts as JSON values, their arrays in ``numbers``.
+
+        Raises
+        ------
+        ValueError
+            in one line that names the part, for a state that is not plain.
+        """
+        return {
+            role: [
+                state_of(part, self._what(role, robot), f"parts/{role}/{robot}", numbers)
+                for robot, part in enumerate(parts)
+                if self._is_used(role, robot)
+            ]
+            for role, parts in self._made.items()
+        }
+
+    def restored(
+        self,
+        tree: Any,
+        numbers: Mapping[str, np.ndarray],
+        constants: np.ndarray,
+        states: np.ndarray,
+    ) -> tuple[np.ndarray, dict[str, list[Any]]]:
+        """What :meth:`go_on` takes: new parts with the states of :meth:`get_state`; nothing here changes.
+
+        Raises
+        ------
+        ValueError
+            in one line that names the part, if it does not take its state.
+        """
+        radii, made = self._started(constants, states)
+        for role, parts in made.items():
+            used = [robot for robot in range(len(parts)) if self._is_used(role, robot)]
+            trees = tree.get(role) if isinstance(tree, dict) else None
+            if not isinstance(trees, list) or len(trees) != len(used):
+                raise ValueError(f"the snapshot is damaged: it has no states for each {role}")
+            for robot, one in zip(used, trees, strict=True):
+                give_state(parts[robot], one, self._what(role, robot), numbers)
+        return radii, made
+
+    def go_on(self, restored: tuple[np.ndarray, dict[str, list[Any]]]) -> None:
+        """Go on with the parts that :meth:`restored` has made."""
+        self._radii, self._made = restored
+
+    def _what(self, role: str, robot: int) -> str:
+        return f"{role.replace('_', ' ')} {self._names[role]!r} of robot_{robot}"
+
+    @staticmethod
+    def _is_used(role: str, robot: int) -> bool:
+        """Whether a part is ever called: the leader's observer is not."""
+        return role != "observer" or robot > 0
 
     def _of(self, role: str) -> list[Any]:
         return self._made.get(role, [])
