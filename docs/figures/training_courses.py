@@ -1,4 +1,4 @@
-"""Courses of the trainings that scripts of the page *Learning* run themselves: kept beside the policies, and drawn."""
+"""Courses of the trainings that scripts of *Learning* run themselves: kept beside the policies, and drawn."""
 
 from __future__ import annotations
 
