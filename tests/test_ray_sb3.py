@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import numpy as np
 import pytest
 
@@ -83,6 +86,26 @@ def test_a_training_goes_through_it(make):
         for a, b in zip(before, model.policy.parameters(), strict=True)
     ]
     assert any(changed)
+
+
+def test_the_example_of_the_page_runs(cluster):
+    """With a smaller cluster, fewer formations and steps."""
+    page = (Path(__file__).parents[1] / "docs" / "scale.md").read_text(encoding="utf-8")
+    (code,) = re.findall(r"```python\n(.*?)```", page, re.DOTALL)
+    for text, small in (
+        ('"auto"', repr(cluster)),
+        ("1024, workers=8", "4, workers=2"),
+        ("batch_size=8192", "batch_size=128"),
+        ("10_000_000", "384"),
+    ):
+        assert text in code
+        code = code.replace(text, small)
+    scope = {}
+    try:
+        exec(compile(code, "scale.md", "exec"), scope)
+        assert scope["model"].num_timesteps == 384
+    finally:
+        scope["envs"].close()
 
 
 def test_attributes_and_methods_are_those_of_the_sub_environments(make):
