@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run compile test test-slow test-learning check check-docs check-install check-lowest check-clients check-pages check-paper browser check-live docs format board speed speed-docs constraints clean
+.PHONY: help run compile test test-slow test-learning check check-audit check-docs check-install check-lowest check-clients check-pages check-paper browser check-live docs format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -99,6 +99,17 @@ check-clients: ## Run the tests with other libraries, each of CLIENTS in a tempo
 		CLIENT=$$client "$$tmp/bin/python" -m pytest -rs tests/test_clients.py; \
 		rm -rf "$$tmp"; \
 	done
+
+# A tool of development (codespell) may have any licence: nothing of it is used by the package.
+REFUSED_LICENCES := GPL-2.0-only;GPL-2.0-or-later;GPL-3.0-only;GPL-3.0-or-later;GNU General Public License v2 (GPLv2);GNU General Public License v3 (GPLv3);GNU Affero General Public License v3
+check-audit: $(VENV)/.stamp-test ## List the licences of all requirements, and look for known vulnerabilities (needs pypi.org)
+	@set -e; \
+	tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \
+	$(PYTHON) -m venv "$$tmp"; \
+	"$$tmp/bin/python" -m pip install -q --disable-pip-version-check pip-audit pip-licenses; \
+	"$$tmp/bin/pip-licenses" --python=$(BIN)/python --format=markdown --ignore-packages codespell \
+		--fail-on "$(REFUSED_LICENCES)"; \
+	"$$tmp/bin/pip-audit" --strict --no-deps --disable-pip -r constraints.txt
 
 # The live windows under real keys and a real mouse; their pictures stay in results/live.
 check-live: $(VENV)/.stamp-test ## Drive the live windows on a virtual display (needs Xvfb and xdotool)

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import typer
@@ -67,6 +67,20 @@ class SlipUkf:
         self._way = np.zeros(2)  # sum of all motions of the pose, without corrections
         self._ways = deque([self._way], maxlen=round(LONGEST_DELAY_S / self._dt_s) + 1)
         self._clear()
+
+    def get_state(self) -> list[Any]:
+        """What it remembers, for ``env.get_state()``: plain values, and no filter."""
+        filtered = self._filter.mean, self._filter.covariance
+        collected = self._samples, self._rolled, self._yawed, self._fixes, self._fix_sum
+        return [filtered, self._pose, list(self._ways), collected]
+
+    def set_state(self, state: list[Any]) -> None:
+        """Go on from what ``get_state`` has returned; ``reset`` was called before."""
+        filtered, self._pose, ways, collected = state
+        self._filter = UnscentedKalmanFilter(*filtered)
+        self._ways = deque(ways, maxlen=self._ways.maxlen)
+        self._way = self._ways[-1]
+        self._samples, self._rolled, self._yawed, self._fixes, self._fix_sum = collected
 
     def _clear(self) -> None:
         """Start to collect readings."""

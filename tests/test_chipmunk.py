@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import gc
 import math
 import pickle
 from pathlib import Path
@@ -328,6 +329,33 @@ def test_copies_in_contact_go_on_bit_for_bit():
     assert env.formation.arrays.touched.any()
     twin = copy.deepcopy(env)
     assert push(twin, 12) == push(env, 12)
+
+
+def test_a_run_does_not_depend_on_when_python_collects_garbage():
+    """Constraints of earlier control steps stay known to their bodies until then."""
+    box = {
+        "shape": {"type": "box", "width_mm": 120.0, "length_mm": 90.0},
+        "x_mm": 0.0,
+        "y_mm": 160.0,
+        "mass_kg": 0.5,
+        "floor_friction": 0.1,
+    }
+    courses = []
+    for often in (False, True):
+        env = environment(robots=1, world={"pushables": [box, {**box, "y_mm": 255.0}]})
+        env.reset(seed=0, options={"poses": [[0.0, 0.0, 0.0]]})
+        gc.disable()
+        try:
+            rows = []
+            for step in range(60):
+                if often:
+                    gc.collect()
+                env.step({"robot_0": [0.3 if step < 30 else -0.3, 0.02]})
+                rows.append([(*one.position, *one.velocity) for one in env.pushable_bodies])
+        finally:
+            gc.enable()
+        courses.append(rows)
+    assert courses[0] == courses[1]
 
 
 @pytest.mark.parametrize("disturbance", ["slip", "ice", "payload", "actuator"])

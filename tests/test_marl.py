@@ -74,13 +74,16 @@ def test_the_figure_is_drawn(make_marl, kept, tmp_path):
 
 
 def test_the_page_says_what_the_runs_show(make_marl, kept):
+    own = "MAPPO, a value and a network for each robot, all observations"
     central = {
         "MAPPO": "one value for the formation {} of 250 nominal runs fail",
-        "MAPPO, a value for each robot": "a value for each robot {}, and",
-        "MAPPO, a value for each robot, all observations": "observations in addition {}.",
+        "MAPPO, all observations": "observations in place of the state {}, with",
+        "MAPPO, a value for each robot": "with a value for each robot {}, and",
+        "MAPPO, a value for each robot, all observations": "with both\n  changes {}.",
+        own: "",
     }
-    of = {name: [one for one in kept if one["variant"] == name] for name in ("IPPO", *central)}
-    assert [len(runs) for runs in of.values()] == [5, 5, 5, 5]
+    of = {name: [one for one in kept if one["variant"] == name] for name in make_marl.VARIANTS}
+    assert [len(runs) for runs in of.values()] == [make_marl.SEEDS] * 7
     failed = {name: sum(sum(one["nominal"]["failed"]) for one in runs) for name, runs in of.items()}
     assert failed["IPPO"] == 0
     medians = {
@@ -95,3 +98,15 @@ def test_the_page_says_what_the_runs_show(make_marl, kept):
         ratios.append(float(middle))
     assert f"{min(ratios):.0f} to {max(ratios):.0f} times smaller" in section()
     assert max(medians["IPPO"]) / min(medians["IPPO"]) == pytest.approx(20, rel=0.1)
+    unshared = "IPPO, a network for each robot"
+    lost = [sum(one["nominal"]["failed"]) for one in of[unshared]]
+    assert sorted(lost) == [0, 0, 0, 0, 50]
+    middle, low, high = make_marl.ratio(medians[unshared], medians["IPPO"]).strip("]").split()
+    assert (f"{float(middle):.1f}", f"{float(low.strip('[,')):.1f}") == ("4.0", "0.7")
+    assert high == "24"
+    assert "4.0 times that with a shared network, with an interval from 0.7 to 24" in section()
+    with_both = "MAPPO, a value for each robot, all observations"
+    found = [
+        make_marl.ratio(medians[name], medians["IPPO"]).split()[0] for name in (own, with_both)
+    ]
+    assert [round(float(one)) for one in found] == [24, 9]

@@ -134,8 +134,15 @@ def test_tasks_with_different_gaps_are_refused():
         )
 
 
-@pytest.mark.parametrize("relayed", [False, True])
-def test_a_correction_is_the_predecessors_error_of_one_gap_ago(relayed):
+@pytest.mark.parametrize(
+    "weights",
+    [
+        arms.OWN_ERROR,
+        arms.CORRECTED_ERROR,
+        arms.Weights(sent=(0.5, -0.2), relayed=(0.9, 0.3), applied=(1.2, 0.7)),
+    ],
+)
+def test_a_correction_is_what_the_predecessor_sent_one_gap_ago(weights):
     scenario = arms.RowVecEnv("infinity", 1, arm=arms.Arm("own"), robots=ROBOTS, **SHORT).plants[0]
     scenario = scenario.scenario
     names = arms.entry_names(scenario)
@@ -145,7 +152,7 @@ def test_a_correction_is_the_predecessors_error_of_one_gap_ago(relayed):
         seen.append(rows.copy())
         return np.zeros((len(rows), 2)), None
 
-    policy = arms.CorrectingPolicy(SimpleNamespace(predict=predict), scenario, relayed)
+    policy = arms.CorrectingPolicy(SimpleNamespace(predict=predict), scenario, weights)
     generator = np.random.default_rng(0)
     rows = generator.normal(size=(3 * GAP, 2 * ROBOTS, len(names))).astype(np.float32)
     places = [names.index(name) for name in ("e_1", "e_2")]
@@ -154,14 +161,17 @@ def test_a_correction_is_the_predecessors_error_of_one_gap_ago(relayed):
     for one in rows:
         _, state = policy.predict(one, state, start)
         start[:] = False
-    sent_mm = (np.array(seen) if relayed else rows)[:, :, places] * 500
+    sent_mm = np.zeros((3 * GAP, 2 * ROBOTS, 2))
     for step in range(3 * GAP):
         heard = ahead(sent_mm[step - GAP]) if step >= GAP else np.zeros((2 * ROBOTS, 2))
         heard = np.clip(heard, -arms.MOST_MM, arms.MOST_MM)
+        own = rows[step][:, places] * 500
+        sent_mm[step] = np.array(weights.sent) * own + np.array(weights.relayed) * heard
         wanted = rows[step].copy()
         for kind, scale in (("", 500), ("_fine", 10)):
             for i in (1, 2):
-                wanted[:, names.index(f"e_{i}{kind}")] += heard[:, i - 1] / scale
+                added = weights.applied[i - 1] * heard[:, i - 1]
+                wanted[:, names.index(f"e_{i}{kind}")] += added / scale
         np.testing.assert_allclose(seen[step], wanted, rtol=1e-4, atol=1e-4)
     assert (np.abs(sent_mm) > 0.1).any()
 
@@ -198,7 +208,7 @@ def test_the_tables_are_those_of_the_kept_runs():
 
 
 def test_every_arm_has_three_trainings_and_the_same_runs():
-    for arm in ("own", "heard", "shared"):
+    for arm in ("learned", "own", "heard", "shared"):
         for cell in script.CELLS:
             mine = script.of(ROWS, cell.name, arm)
             assert [row["seed"] for row in mine] == [0, 1, 2]
@@ -255,6 +265,24 @@ def test_what_the_messages_gain_and_cost():
         only = script.of(ROWS, slip, arm)[0]
         assert sum(only["failed"]) == 1
         assert only["row_mm"][only["failed"].index(1)][-1] == pytest.approx(240, abs=5)
+
+
+def test_the_learned_message_is_the_relayed_one():
+    searches = [row for row in ROWS if row["cell"] == "training" and row["arm"] == "learned"]
+    assert [row["seed"] for row in searches] == [0, 1, 2]
+    weights = [value for row in searches for value in row["weights"]]
+    assert f"at weights of {min(weights):.2f} to {max(weights):.2f}" in TEXT
+    for row in searches:
+        assert len(row["score_mm"]) == script.TRIALS == 60
+        assert row["score_mm"][-1] < 0.6 * row["score_mm"][0]
+    for cell in NAMES:
+        assert apart(cell, "learned", "base", PATH).high < 0
+        found = apart(cell, "learned", "relayed", PATH)
+        assert found.low < 0 < found.high
+        assert abs(found.median) < (0.1 if cell in NAMES[:2] else 0.3)
+    runs = [row for row in ROWS if row["arm"] == "learned" and "failed" in row]
+    lost = [one for row in runs for one in row["failed"]]
+    assert (len(lost), sum(lost)) == (210, 0)
 
 
 def test_all_that_the_predecessor_observes_gains_nothing_clear():

@@ -195,6 +195,20 @@ def test_the_page_has_what_was_measured(monkeypatch):
     assert lost["∞, nominal"] == lost["flower, nominal"] == 0
     assert {one["cells"]["∞, nominal"]["runs"] for one in trained} == {100}
     assert f"{lost['`slip`']} of 90 runs under `slip`" in section
+    board = kept["seed_0"]["board"]
+    score, (low, high) = board["score"]["iqm"], board["score"]["interval"]
+    assert (
+        f"a score of {score:.1f} [{low:.1f}, {high:.1f}] with seed 0, "
+        f"{board['failed']} of {board['runs']} runs failed" in section
+    )
+    worst = board["failed_of"]
+    assert sum(worst.values()) == board["failed"]
+    assert f"(`fixes-outage`, {worst['infinity, fixes-outage']} of 100 on the ∞)" in section
+    assert f"under `slip-noise` ({worst['infinity, slip-noise']} of 100)" in section
+    published = json.loads((DOCS / "leaderboard" / "leaderboard.json").read_text("utf-8"))
+    better = sum(one["score"]["iqm"] > score for one in published["policies"])
+    assert (better, len(published["policies"])) == (8, 10)
+    assert "ninth of eleven" in section
     training = [one["training"] for name, one in sorted(kept.items()) if name.startswith("seed_")]
     assert all(one["kept_at"] == 0 for one in training)  # PPO added nothing
     for name in ("imitated_mm", "ended_mm"):

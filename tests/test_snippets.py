@@ -22,6 +22,7 @@ BLOCK = re.compile(r"```python\n(.*?)```(?:\n\n```text\n(.*?)```)?", re.DOTALL)
 ELSEWHERE = {
     "docs/compatibility.md": "tests/test_clients.py",  # with each library in an environment of its own
     "docs/extending.md": "tests/test_extending.py",
+    "docs/scale.md": "tests/test_ray_sb3.py",
 }
 # Blocks that need what no test has, by page and number: they are only compiled.
 COMPILED = {

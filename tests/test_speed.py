@@ -5,10 +5,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from baselines.speed import parts, speed
+from baselines.speed import environments, parts, speed
 from baselines.speed.environments import ALONE, MPE2, VECTOR, VMAS
 from baselines.speed.moments import DRIVEN, Moments
-from tlf_env import BatchPlant
+from tlf_env import BatchPlant, load_scenario
 from tlf_env.engine.arrays import make_arrays, padded
 from tlf_env.engine.formation import reference_table
 from tlf_env.envs.vector import FormationVectorEnv
@@ -51,6 +51,21 @@ def test_without_peers_and_batches_only_our_own_formations_are_timed():
     found = speed.measure(2, 1, formations=(), peers=False, parts=False)
     assert {row["env"] for row in found["results"]} == {ALONE, "tlf_env/wide-circle-v0"}
     assert found["ratios"] == []
+
+
+def test_special_scenarios_are_timed_beside_the_usual_one(monkeypatch):
+    """Those of few fixes and of sliding robots, and they are compared with the peers, too."""
+    monkeypatch.setattr(environments, "SPECIAL_FORMATIONS", 3)
+    monkeypatch.setattr(speed, "SPECIAL_FORMATIONS", 3)
+    found = speed.measure(2, 1, formations=(3,), threads=(1,), parts=False)
+    timed = {row["env"] for row in found["results"]}
+    assert timed >= {f"{VECTOR}, fixes at 100 Hz", f"{VECTOR}, combined-hard"}
+    if MPE2 in timed:
+        compared = {row["env"] for row in found["ratios"] if row["to"] == MPE2}
+        assert compared == {ALONE, VECTOR, *environments.SPECIAL}
+    usual = load_scenario("infinity").disturbance
+    for fields in environments.SPECIAL.values():
+        assert load_scenario("infinity", **fields).disturbance != usual
 
 
 @pytest.mark.parametrize(

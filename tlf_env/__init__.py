@@ -14,6 +14,7 @@ import pettingzoo
 
 if TYPE_CHECKING:
     from tlf_env.engine.batch import BatchPlant
+    from tlf_env.engine.snapshot import Snapshot
     from tlf_env.envs.parallel import aec_env, parallel_env
     from tlf_env.onboard.parts import Estimated, Readings
     from tlf_env.task.info import EndReason, TouchedBy
@@ -26,6 +27,7 @@ __all__ = [
     "Estimated",
     "Readings",
     "Scenario",
+    "Snapshot",
     "TouchedBy",
     "__version__",
     "aec_env",
@@ -38,6 +40,7 @@ _MODULES = {
     "EndReason": "tlf_env.task.info",
     "Estimated": "tlf_env.onboard.parts",
     "Readings": "tlf_env.onboard.parts",
+    "Snapshot": "tlf_env.engine.snapshot",
     "TouchedBy": "tlf_env.task.info",
     "aec_env": "tlf_env.envs.parallel",
     "parallel_env": "tlf_env.envs.parallel",

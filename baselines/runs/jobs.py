@@ -5,6 +5,7 @@ from __future__ import annotations
 import fcntl
 import json
 import os
+import socket
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
@@ -19,6 +20,7 @@ from tlf_env.common.errors import install_command, shown
 from tlf_env.common.files import atomic, read_json
 
 POLLED_EVERY_S = 0.5
+CONNECT_WITHIN_S = 10.0  # to a Ray cluster
 
 SharedT = TypeVar("SharedT")
 JobT = TypeVar("JobT")
@@ -176,14 +178,7 @@ def _on_ray(
     ahead: int,
     meanwhile: Callable[[], None],
 ) -> Iterator[AnswerT]:
-    try:
-        import ray
-    except ModuleNotFoundError as error:
-        raise ValueError(f"--ray needs ray ({install_command('ray')})") from error
-    try:
-        ray.init(address=address, log_to_driver=False)
-    except (ConnectionError, ValueError, RuntimeError) as error:
-        raise ValueError(f"no Ray cluster at {address!r}: {error}") from error
+    ray = connected_ray(address)
     try:
         submit = partial(ray.remote(num_cpus=1)(function).remote, ray.put(shared))
         limit = ahead * max(1, int(ray.cluster_resources().get("CPU", 1)))
@@ -198,3 +193,27 @@ def _on_ray(
             yield from ray.get(done)
     finally:
         ray.shutdown()
+
+
+def connected_ray(address: str | None) -> Any:
+    """The module ``ray``, connected to the cluster at an address; None starts Ray on this machine.
+
+    Raises
+    ------
+    ValueError
+        if ray is not installed, or no cluster is at the address.
+    """
+    try:
+        import ray
+    except ModuleNotFoundError as error:
+        raise ValueError(f"a Ray cluster needs ray ({install_command('ray')})") from error
+    host, _, port = (address or "").rpartition(":")
+    try:
+        if host and "//" not in host and port.isdecimal():
+            socket.create_connection(
+                (host, int(port)), CONNECT_WITHIN_S
+            ).close()  # Ray waits minutes
+        ray.init(address=address, log_to_driver=False)
+    except (OSError, OverflowError, ValueError, RuntimeError) as error:
+        raise ValueError(f"no Ray cluster at {address!r}: {error}") from error
+    return ray

@@ -9,10 +9,9 @@ from collections.abc import Iterable, Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
-import numba
-
 from tlf_env.common.digest import code_digest
-from tlf_env.numerics.compiled import PACKAGE, ROOMS_WITH_LAWS
+from tlf_env.numerics.compiled import PACKAGE
+from tlf_env.numerics.compiled import simulation_digest as simulation_digest
 
 REPORTED_PACKAGES = ("tlf-env", "numpy", "numba", "gymnasium", "pettingzoo", "pymunk")
 PLACE_OPTIONS = ("--out", "--processes", "--workers", "--ray")
@@ -66,15 +65,6 @@ def physics_digest() -> str:
     Results with the same scenario hash and the same physics digest are comparable.
     """
     return code_digest(PACKAGE / room for room in ("physics", "numerics"))
-
-
-@functools.cache
-def simulation_digest() -> str:
-    """Digest of all code that can hold a law, without comments and docstrings, and of Numba's version.
-
-    Interrupted work is resumed only with the same simulation digest.
-    """
-    return code_digest((PACKAGE / room for room in ROOMS_WITH_LAWS), numba.__version__)
 
 
 def command_line(words: Sequence[str]) -> str:

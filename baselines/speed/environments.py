@@ -22,6 +22,12 @@ MPE2, VMAS, ALONE, VECTOR = (
     "tlf_env.FormationVectorEnv",
 )
 PEER_ROBOTS = 3  # of VMAS
+# Scenarios that cost less or more: few position fixes, and robots that slide.
+SPECIAL: dict[str, dict[str, Any]] = {
+    f"{VECTOR}, fixes at 100 Hz": {"disturbance": {"position": {"period_s": 0.01}}},
+    f"{VECTOR}, combined-hard": {"disturbance": "combined-hard"},
+}
+SPECIAL_FORMATIONS = 1024
 VMAS_SHARE = 0.1
 PEER_CYCLES = 25  # simple_spread's own default episode
 FORMATION_STEPS = (
@@ -90,6 +96,18 @@ def vector_environments(
             for used in threads
             if used == 1 or count > 1
         ]
+    return made
+
+
+def special_environments(steps: int) -> list[TimedEnvironment]:
+    """The vector environment of :data:`SPECIAL`, at one size and with one thread."""
+    made = []
+    for name, fields in SPECIAL.items():
+        moments = Moments(PEER_ROBOTS, max(STEPS_KEPT, steps), **fields)
+        run = VectorRun(moments, SPECIAL_FORMATIONS)
+        made.append(
+            TimedEnvironment(name, PEER_ROBOTS, partial(run.drive, threads=1), SPECIAL_FORMATIONS)
+        )
     return made
 
 

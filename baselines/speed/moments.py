@@ -27,10 +27,21 @@ STEPS_KEPT = 1500  # of the learner's actions, from each moment on
 
 
 class Moments:
-    """States of some formations under the reference at several moments of a lap, and all their actions."""
+    """States of some formations under the reference at several moments of a lap, and all their actions.
 
-    def __init__(self, robots: int, kept: int = STEPS_KEPT) -> None:
-        plant = BatchPlant("infinity", SEEDS, robots=robots, end_on=(), **DRIVEN)
+    Parameters
+    ----------
+    robots
+        In each formation.
+    kept
+        Control steps of actions that are kept from the last moment on.
+    **fields
+        Further fields of the scenario.
+    """
+
+    def __init__(self, robots: int, kept: int = STEPS_KEPT, **fields: Any) -> None:
+        self.fields = {"robots": robots, "end_on": (), **DRIVEN, **fields}
+        plant = BatchPlant("infinity", SEEDS, **self.fields)
         plant.reset(seed=0)
         plant.arrays.kinds[:] = REFERENCE
         idle = np.zeros(plant.arrays.actions.shape)
@@ -87,12 +98,7 @@ class VectorRun:
     def __init__(self, moments: Moments, formations: int) -> None:
         self.moments, self.formations = moments, formations
         self.env = FormationVectorEnv(
-            "infinity",
-            formations,
-            robots=moments.robots,
-            end_on=(),
-            threads=max(THREADS),
-            **DRIVEN,
+            "infinity", formations, threads=max(THREADS), **moments.fields
         )
         self.env.reset(seed=0)
         self._next = moments.kept

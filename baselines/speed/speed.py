@@ -13,11 +13,14 @@ from baselines.runs.provenance import installed_versions, versions
 from baselines.speed.environments import (
     ALONE,
     MPE2,
+    SPECIAL,
+    SPECIAL_FORMATIONS,
     VECTOR,
     VMAS,
     TimedEnvironment,
     mpe2_environment,
     single_formation,
+    special_environments,
     vector_environments,
     vmas_environments,
 )
@@ -55,7 +58,8 @@ def measure(
     repeats
         Timings of each environment.
     formations, threads
-        Numbers for the vector environment and VMAS; without formations both are left out.
+        Numbers for the vector environment and VMAS; without formations both are left out. Scenarios that cost
+        less or more than usual are timed if 1024 formations or more are among them.
     peers
         Whether to time mpe2 and VMAS, too, if they are installed.
     parts
@@ -88,6 +92,8 @@ def measure(
     if formations:
         for robots in ROBOTS:
             timed += vector_environments(robots, formations, threads, steps)
+        if max(formations) >= SPECIAL_FORMATIONS:
+            timed += special_environments(steps)
         if peers:
             timed += vmas_environments(formations, threads)
     rates: dict[tuple[str, int, int, int], list[float]] = {one.key: [] for one in timed}
@@ -148,10 +154,10 @@ def _ratios(rates: dict[tuple[str, int, int, int], list[float]]) -> list[dict[st
     """Ratios of our rates to mpe2's with as many robots, and to VMAS's with as many formations and threads."""
     ratios = []
     for (name, robots, formations, threads), values in rates.items():
-        if name not in (ALONE, VECTOR):
+        if name not in (ALONE, VECTOR, *SPECIAL):
             continue
         beside = [(MPE2, robots, 1, 1)]
-        if name == VECTOR:
+        if name != ALONE:
             beside.append((VMAS, robots, formations, threads))
         for key in beside:
             if key not in rates:

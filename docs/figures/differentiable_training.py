@@ -17,6 +17,7 @@ import numpy as np
 import torch
 from differentiable_model import Model, Nature, State, driven, hypot
 from torch import Tensor
+from training_courses import Course
 
 from baselines.policies.card import write_policy
 from baselines.policies.network import Network
@@ -226,7 +227,7 @@ def train(seed: int, folder: Path) -> None:
     """Train with one seed and keep the last policy: windows of the model, and a learned value at their ends."""
     torch.set_num_threads(1)
     torch.manual_seed(seed)
-    began = time.process_time()
+    began, course = time.process_time(), Course()
     model = Model(learner())
     tasks = [
         load_scenario(task, action="tracking_twist", robots=3) for task in ("infinity", "flower")
@@ -275,10 +276,12 @@ def train(seed: int, folder: Path) -> None:
         with torch.no_grad():
             for mine, theirs in zip(target.parameters(), value.parameters(), strict=True):
                 mine.lerp_(theirs, 0.05)
+        course.note(window, float(torch.stack([one.reward for one in seen]).detach().mean()))
         if window % 100 == 0:
             error = torch.hypot(*(rows[:, :2] * model.scales[:2]).unbind(-1)).median()
             print(f"window {window}: median error {float(error):.1f} mm", flush=True)
     save(policy, seed, folder, time.process_time() - began)
+    course.keep(folder)
 
 
 def learner() -> Scenario:

@@ -28,6 +28,7 @@ from make_board import DOCS
 from make_figures import BLUE, GREY, ORANGE, STYLE
 from make_parts import put
 from make_speed import table
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from baselines.policies.registry import fit_policy
@@ -244,20 +245,28 @@ def draw(rows: Sequence[Row], path: Path) -> None:
             count = min(len(row["course"]) for row in mine)
             course = np.array([row["course"][:count] for row in mine], dtype=np.float64)
             steps, scores, _, minutes = np.moveaxis(course, 2, 0)
-            low, middle, high = scores.min(axis=0), np.median(scores, axis=0), scores.max(axis=0)
             for panel, along in ((left, steps / MILLION), (right, minutes)):
-                if np.isnan(along).any():
-                    continue
-                x = np.median(along, axis=0)
-                label = f"{entry.label.replace('`', '')}, {len(mine)} seed{'s' * (len(mine) > 1)}"
-                panel.plot(x, middle, entry.line, color=entry.colour, label=label, marker=".")
-                panel.fill_between(x, low, high, color=entry.colour, alpha=0.2, lw=0)
+                if np.isfinite(along).all():
+                    draw_scores(panel, np.median(along, axis=0), scores, entry)
         left.set(
             xlabel="robot steps, millions", ylabel="score on validation seeds, mm", yscale="log"
         )
         right.set(xlabel="minutes of a core")
         left.legend(fontsize="small")
         figure.savefig(path, dpi=110)
+
+
+def draw_scores(
+    panel: Axes, along: np.ndarray, scores: np.ndarray, entry: Entry, marker: str = "."
+) -> None:
+    """Draw the scores of an entry's training seeds ``(seed, evaluation)``: median and range."""
+    label = f"{entry.label.replace('`', '')}, {len(scores)} seed{'s' * (len(scores) > 1)}"
+    panel.plot(
+        along, np.median(scores, axis=0), entry.line, color=entry.colour, label=label, marker=marker
+    )
+    panel.fill_between(
+        along, scores.min(axis=0), scores.max(axis=0), color=entry.colour, alpha=0.2, lw=0
+    )
 
 
 def main() -> None:

@@ -23,10 +23,13 @@ import numpy as np
 import torch
 from differentiable_model import Model, State, driven, usual
 from differentiable_training import Formations, driven_on, learner, step_of, train
+from make_algorithms import Entry
 from make_board import DOCS
+from make_figures import BLUE
 from make_parts import put
 from make_speed import table
 from torch import Tensor
+from training_courses import courses_of, draw_courses
 
 from baselines.policies.card import read_policy
 from baselines.policies.learned import load_policy
@@ -42,6 +45,7 @@ from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import SETTLE_FRACTION, load_scenario
 
 PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "differentiable.json"
+PICTURE = RESULTS.with_suffix(".png")
 TRAINED = Path("results/differentiable")
 CHECK_S, CHECK_RUNS = 40.0, 4
 HORIZON_S = 60.0
@@ -223,7 +227,7 @@ def shown_cell(median_mm: float, lost: int) -> str:
 def main() -> None:
     """Make what is asked for, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
-    parser.add_argument("what", nargs="?", choices=("check", "train", "judge"))
+    parser.add_argument("what", nargs="?", choices=("check", "train", "judge", "courses"))
     parser.add_argument("--seeds", default="0,1,2", help="of the trainings")
     parser.add_argument("--runs", type=int, default=100, help="of each cell")
     parser.add_argument("--trained", type=Path, default=TRAINED)
@@ -239,6 +243,8 @@ def main() -> None:
             kept["check"] = check()
         case "judge":
             kept["judged"] = judge(given.trained, given.runs)
+        case "courses":
+            kept["courses"] = courses_of(given.trained, "model")
     with atomic(RESULTS, encoding="utf-8") as file:
         json.dump(kept, file, separators=(",", ":"))
         file.write("\n")
@@ -246,6 +252,14 @@ def main() -> None:
         put(PAGE, checked_table(kept["check"]), "differentiable-check")
     if "judged" in kept:
         put(PAGE, judged_table(kept["judged"]), "differentiable")
+    if "courses" in kept:
+        draw_courses(
+            kept["courses"],
+            [Entry("model", "through the model", BLUE)],
+            PICTURE,
+            along="windows",
+            values="mean reward of a window, in the model",
+        )
 
 
 if __name__ == "__main__":

@@ -55,6 +55,9 @@ VARIANTS = {
         "Mappo", true_state=False, one_value=False
     ),
     "IPPO, a network for each robot": Variant("Ippo", shared=False),
+    "MAPPO, a value and a network for each robot, all observations": Variant(
+        "Mappo", shared=False, true_state=False, one_value=False
+    ),
 }
 STYLES = {
     "IPPO": ("#0072B2", "-"),
@@ -63,6 +66,7 @@ STYLES = {
     "MAPPO, a value for each robot": ("#009E73", "-."),
     "MAPPO, a value for each robot, all observations": ("#000000", ":"),
     "IPPO, a network for each robot": ("#56B4E9", (0, (1, 1))),
+    "MAPPO, a value and a network for each robot, all observations": ("#E69F00", (0, (3, 2))),
 }
 
 

@@ -10,7 +10,8 @@ estimate these from the present observation and from histories.
 its history (``plain``), or without it and with the drawn numbers as further entries, which no robot can know
 (``truth``).
 
-``judge`` runs what was trained on seeds that nothing was tuned on.
+``judge`` runs what was trained on seeds that nothing was tuned on, and ``courses`` keeps the courses of the
+trainings.
 """
 
 from __future__ import annotations
@@ -24,10 +25,13 @@ from typing import Any, NamedTuple
 import gymnasium
 import numpy as np
 import torch
+from make_algorithms import MILLION, Entry
 from make_board import DOCS
+from make_figures import BLUE, GREY, ORANGE
 from make_parts import put
 from make_speed import table
 from stable_baselines3 import PPO
+from training_courses import Course, courses_of, draw_courses
 
 from baselines.data.episodes import entry_names
 from baselines.policies.history import History, Past
@@ -53,7 +57,13 @@ from tlf_env.task.scenario import Scenario, load_scenario
 
 PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "memory.json"
 TRAINED = Path("results/memory")
+PICTURE = RESULTS.with_suffix(".png")
 ARMS = ("plain", "history", "truth")
+DRAWN = (
+    Entry("plain", "without", GREY, "-"),
+    Entry("history", "history", BLUE, "--"),
+    Entry("truth", "truth", ORANGE, "-."),
+)
 POLICY_FILE, MODEL_FILE = "policy.safetensors", "policy.zip"  # the latter of the arm `truth`
 HORIZON_S = 60.0
 CELLS = (
@@ -163,9 +173,12 @@ def train_arm(arm: str, seeds: Sequence[int], trained: Path) -> None:
         )
         model = make_model(config, envs, seed)
         spread_out(model, envs, config.seeds[0])
+        course = Course()
         while model.num_timesteps < config.robot_steps:
             set_learning_rate(model, config)
             model.learn(rollout_steps(model), reset_num_timesteps=False, log_interval=None)
+            course.note(model.num_timesteps, float(model.rollout_buffer.rewards.mean()))
+        course.keep(folder)
         if arm == "truth":
             model.save(folder / MODEL_FILE)
         else:
@@ -406,7 +419,7 @@ def main() -> None:
     """Make what is asked for, and write the tables."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "what", nargs="*", help="probe; train ARM; judge; nothing: the tables alone"
+        "what", nargs="*", help="probe; train ARM; judge; courses; nothing: tables and figure"
     )
     parser.add_argument("--seeds", default="0,1,2", help="of the trainings")
     parser.add_argument("--runs", type=int, default=30, help="of each cell")
@@ -421,10 +434,12 @@ def main() -> None:
             kept["probe"] = probe()
         case ["judge"]:
             kept["judged"] = judge(given.trained, given.runs)
+        case ["courses"]:
+            kept["courses"] = [one for arm in ARMS for one in courses_of(given.trained / arm, arm)]
         case []:
             pass
         case _:
-            parser.error(f"{' '.join(given.what)!r} is none of probe, train ARM, judge")
+            parser.error(f"{' '.join(given.what)!r} is none of probe, train ARM, judge, courses")
     with atomic(RESULTS, encoding="utf-8") as file:
         json.dump(kept, file, separators=(",", ":"))
         file.write("\n")
@@ -432,6 +447,15 @@ def main() -> None:
         put(PAGE, probed_table(kept["probe"]), "probe")
     if "judged" in kept:
         put(PAGE, judged_table(kept["judged"]), "memory")
+    if "courses" in kept:
+        draw_courses(
+            kept["courses"],
+            DRAWN,
+            PICTURE,
+            along="robot steps, millions",
+            values="mean reward of a rollout",
+            scale=MILLION,
+        )
 
 
 if __name__ == "__main__":

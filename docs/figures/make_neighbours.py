@@ -4,11 +4,13 @@ Writes ``docs/learning/neighbours.json``, the tables of the section *Neighbours 
 ``docs/learning.md``, and ``docs/learning/neighbours.png``. It needs the extra ``train``.
 ``python docs/figures/make_neighbours.py`` makes tables and figure from the file. Before that:
 
-``train ARM`` trains an arm of ``neighbours_arms.py`` with some seeds and no evaluation.
+``train ARM`` trains an arm of ``neighbours_arms.py`` with some seeds and no evaluation; ``train learned``
+searches the weights of a message with Optuna, which needs the extra ``tune``.
 
 ``probe`` fits networks that estimate a follower's error half a second later from what it sees in an arm.
 
 ``judge`` runs what was trained on seeds that nothing was tuned on; with ``--only ARM`` one arm alone.
+``courses`` keeps the courses of the trainings without judging them again.
 """
 
 from __future__ import annotations
@@ -24,7 +26,9 @@ import numpy as np
 import torch
 from generalisation_kick import SLIPPING, displacements_mm, row_scenario
 from generalisation_runs import along_row
+from make_algorithms import MILLION, Entry
 from make_board import DOCS
+from make_figures import BLUE, GREY, ORANGE
 from make_memory import difference, explained
 from make_parts import put
 from make_speed import table
@@ -33,14 +37,18 @@ from matplotlib.figure import Figure
 from matplotlib.ticker import FormatStrFormatter, LogLocator, MaxNLocator, NullLocator
 from neighbours_arms import (
     ARMS,
+    CORRECTED_ERROR,
+    OWN_ERROR,
     Arm,
     CorrectingPolicy,
     RowPolicy,
     RowVecEnv,
     Sight,
+    Weights,
     leaders_of,
 )
 from stable_baselines3 import PPO
+from training_courses import Course, courses_of, draw_courses
 
 from baselines.data.episodes import entry_names
 from baselines.policies.registry import fit_policy
@@ -56,9 +64,14 @@ from tlf_env.onboard.parts import Policy
 from tlf_env.task.scenario import Scenario, load_scenario
 
 PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "neighbours.json"
-PICTURE = RESULTS.with_suffix(".png")
+PICTURE, COURSES = RESULTS.with_suffix(".png"), RESULTS.with_name("neighbours-courses.png")
+COURSES_DRAWN = (
+    Entry("own", "own", GREY, "-"),
+    Entry("heard", "heard", BLUE, "--"),
+    Entry("shared", "shared", ORANGE, "-."),
+)
 TRAINED = Path("results/neighbours")
-MODEL_FILE, ABOUT_FILE = "policy.zip", "about.json"
+MODEL_FILE = "policy.zip"
 ROW = 5  # robots of a training; with six or more, robots of the ∞ meet at its crossing
 FAR = {"range_mm": 5000.0}  # the largest range: a neighbour is always heard
 ROBOT_STEPS, FORMATIONS = 1_000_000, 32
@@ -71,12 +84,17 @@ DISTURBANCES = {
     "patches": 2,
 }
 BASE_POLICY = "reference:linearised"  # beneath all arms
-BASE, HOP, RELAYED = (
-    "base",
-    "hop",
-    "relayed",
-)  # without learning: no message, or that of CorrectingPolicy
-LAWS = (BASE, HOP, RELAYED)
+# No message, the messages of CorrectingPolicy that are written by hand, and one whose weights are learned.
+BASE, HOP, RELAYED, LEARNED = "base", "hop", "relayed", "learned"
+BY_HAND = {HOP: OWN_ERROR, RELAYED: CORRECTED_ERROR}
+LAWS = (BASE, HOP, RELAYED, LEARNED)
+WEIGHTS_FILE = "weights.json"
+TRIALS, TRIAL_RUNS = (
+    60,
+    4,
+)  # of a search; runs of each cell in a trial, from TRIAL_RUNS · training seed on
+LEAST, MOST = -0.5, 1.5  # weights that are tried
+FAILED_MM = 1000.0  # counted for a failed run
 
 
 class Cell(NamedTuple):
@@ -128,17 +146,17 @@ def train_arm(name: str, seeds: Sequence[int], trained: Path) -> None:
     for seed in seeds:
         folder = trained / name / f"seed_{seed}"
         folder.mkdir(parents=True, exist_ok=True)
-        began_s = time.process_time()
         envs = RowVecEnv(tasks, config.formations, arm=arm, mixture=shares, infos=False)
         model = make_model(config, envs, seed)
         spread_out(model, envs, config.seeds[0])
+        course = Course()
         while model.num_timesteps < config.robot_steps:
             set_learning_rate(model, config)
             model.learn(rollout_steps(model), reset_num_timesteps=False, log_interval=None)
+            course.note(model.num_timesteps, float(model.rollout_buffer.rewards.mean()))
         model.save(folder / MODEL_FILE)
-        about = {"minutes": round((time.process_time() - began_s) / 60, 2)}
-        (folder / ABOUT_FILE).write_text(json.dumps(about) + "\n", encoding="utf-8")
-        print(name, seed, about, envs.end_shares(), flush=True)
+        course.keep(folder)
+        print(name, seed, envs.end_shares(), flush=True)
 
 
 def scenario_of(cell: Cell) -> Scenario:
@@ -162,9 +180,52 @@ def short(values: Any) -> list[float]:
     return [float(f"{value:.{SIGNIFICANT}g}") for value in values]
 
 
-def driven(policy: Policy, scenario: Scenario, runs: int) -> dict[str, Any]:
+def learn_message(seeds: Sequence[int], trained: Path) -> None:
+    """Search the weights of a message that bring the last robot nearest to the leader's path."""
+    import optuna
+
+    optuna.logging.set_verbosity(optuna.logging.WARNING)
+    names = [f"{name}_{axis}" for name in Weights._fields for axis in ("forward", "right")]
+    cells = [cell for cell in CELLS if cell.task == "infinity"]
+    for seed in seeds:
+        began_s = time.process_time()
+
+        def score_mm(trial: optuna.Trial, first: int = TRIAL_RUNS * seed) -> float:
+            values = [trial.suggest_float(name, LEAST, MOST) for name in names]
+            found = []
+            for cell in cells:
+                policy, scenario = law_of(weights_of(values), scenario_of(cell))
+                one = driven(policy, scenario, TRIAL_RUNS, first)
+                last = [row[-1] for row in one["path_mm"]]
+                found += np.where(one["failed"], FAILED_MM, last).tolist()
+            return float(np.mean(found))
+
+        study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=seed))
+        study.enqueue_trial(dict.fromkeys(names, 0.0))  # no message
+        study.optimize(score_mm, n_trials=TRIALS)
+        scores = [trial.value for trial in study.trials]
+        about = {
+            "weights": short(study.best_params[name] for name in names),
+            "score_mm": short(np.minimum.accumulate(scores)),
+            "minutes": round((time.process_time() - began_s) / 60, 2),
+        }
+        folder = trained / LEARNED / f"seed_{seed}"
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / WEIGHTS_FILE).write_text(json.dumps(about) + "\n", encoding="utf-8")
+        print(LEARNED, seed, about, flush=True)
+
+
+def weights_of(values: Sequence[float]) -> Weights:
+    """The weights of six numbers: forward and to the right of each."""
+    sent, relayed, applied = zip(values[::2], values[1::2], strict=True)
+    return Weights(sent, relayed, applied)
+
+
+def driven(
+    policy: Policy, scenario: Scenario, runs: int, first: int = FIRST_TABLE_SEED
+) -> dict[str, Any]:
     """Errors of every robot in some runs, mm, and whether these failed."""
-    seeds = range(FIRST_TABLE_SEED, FIRST_TABLE_SEED + runs)
+    seeds = range(first, first + runs)
     found: dict[str, Any] = {"failed": [], "row_mm": [], "path_mm": []}
     for record in run_seeds(scenario, policy, seeds):
         found["failed"].append(int(failed(record.metrics())))
@@ -179,24 +240,37 @@ def kicked(policy: Policy, scenario: Scenario) -> list[float]:
     return short(displacements_mm(scenario, policy, FIRST_TABLE_SEED))
 
 
-def law_of(name: str, scenario: Scenario) -> tuple[Policy, Scenario]:
-    """An arm without learning, and the scenario with what it needs."""
+def law_of(weights: Weights | None, scenario: Scenario) -> tuple[Policy, Scenario]:
+    """The default system with a message, or without one, and the scenario with what it needs."""
     policy, needed, _ = fit_policy(BASE_POLICY, scenario)
-    if name != BASE:
-        policy = CorrectingPolicy(policy, needed, relayed=name == RELAYED)
+    if weights is not None:
+        policy = CorrectingPolicy(policy, needed, weights)
     return policy, needed
+
+
+def judge_law(name: str, seed: int, weights: Weights | None) -> list[dict[str, Any]]:
+    """What the default system with a message does in every cell, and when one robot slips."""
+    rows, about = [], {"arm": name, "seed": seed}
+    for cell in CELLS:
+        policy, scenario = law_of(weights, scenario_of(cell))
+        rows.append({"cell": cell.name, **about, **driven(policy, scenario, cell.most_runs)})
+    if seed == KICKED_SEED:
+        moved = kicked(*law_of(weights, row_scenario()))
+        rows.append({"cell": "kick", **about, "moved_mm": moved})
+    return rows
 
 
 def judge_arm(name: str, seeds: Sequence[int], trained: Path) -> list[dict[str, Any]]:
     """What the trainings of an arm do in every cell, and when one robot slips."""
     rows = []
+    if name == LEARNED:
+        for seed in seeds:
+            found = json.loads((trained / name / f"seed_{seed}" / WEIGHTS_FILE).read_text("utf-8"))
+            rows += judge_law(name, seed, weights_of(found["weights"]))
+            rows.append({"cell": "training", "arm": name, "seed": seed, **found})
+        return rows
     if name in LAWS:
-        for cell in CELLS:
-            policy, scenario = law_of(name, scenario_of(cell))
-            found = driven(policy, scenario, cell.most_runs)
-            rows.append({"cell": cell.name, "arm": name, "seed": 0, **found})
-        moved = kicked(*law_of(name, row_scenario()))
-        return [*rows, {"cell": "kick", "arm": name, "seed": 0, "moved_mm": moved}]
+        return judge_law(name, 0, BY_HAND.get(name))
     arm = ARMS[name]
     for seed in seeds:
         folder = trained / name / f"seed_{seed}"
@@ -211,9 +285,15 @@ def judge_arm(name: str, seeds: Sequence[int], trained: Path) -> list[dict[str, 
             scenario = row_scenario(**config_of(arm).scenario)
             moved = kicked(RowPolicy(model, arm, scenario), scenario)
             rows.append({"cell": "kick", **about, "moved_mm": moved})
-        minutes = json.loads((folder / ABOUT_FILE).read_text("utf-8"))["minutes"]
-        rows.append({"cell": "training", **about, "minutes": minutes})
-    return rows
+    return rows + trainings(name, trained)
+
+
+def trainings(name: str, trained: Path) -> list[dict[str, Any]]:
+    """The courses of an arm's trainings, a row for each."""
+    return [
+        {"cell": "training", **one, "seed": int(one["seed"].removeprefix("seed_"))}
+        for one in courses_of(trained / name, name)
+    ]
 
 
 def joined(rows: list[dict[str, Any]], new: list[dict[str, Any]]) -> list[dict[str, Any]]:
@@ -246,7 +326,7 @@ def foreseen(
 ) -> tuple[dict[str, np.ndarray], np.ndarray]:
     """What followers see in runs of the base, and their errors half a second later, ``(row, entry)``."""
     cell = next(one for one in CELLS if one.disturbance == disturbance)
-    policy, scenario = law_of(BASE, scenario_of(cell))
+    policy, scenario = law_of(None, scenario_of(cell))
     plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), runs)
     plant.reset(first_seed)
     driver = PolicyDriver(policy, scenario, plant.arrays, BASE)
@@ -403,7 +483,7 @@ def probe_table(rows: list[dict[str, Any]]) -> str:
 
 
 PAIRS = (("heard", "own"), ("two", "heard"), ("shared", "heard"))
-BY_MESSAGES = ((HOP, BASE), (RELAYED, BASE))
+BY_MESSAGES = ((HOP, BASE), (RELAYED, BASE), (LEARNED, RELAYED))
 DRAWN = ("∞, 5 robots, `slip`", "∞, 5 robots, `patches`", "circle, 10 robots, `slip`")
 DASHES = ("-", (0, (6, 2)), (0, (1, 1)), (0, (5, 1, 1, 1)), "-", (0, (3, 1)), (0, (2, 2)), "-")
 DPI, TICKS = 110, (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)
@@ -464,7 +544,7 @@ def main() -> None:
     """Make what is asked for, and write tables and figure."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument(
-        "what", nargs="*", help="train ARM; judge; probe; nothing: tables and figure alone"
+        "what", nargs="*", help="train ARM; judge; courses; probe; nothing: tables and figures"
     )
     parser.add_argument("--seeds", default="0,1,2", help="of the trainings")
     parser.add_argument("--only", choices=(*LAWS, *ARMS), help="judge one arm, and keep the others")
@@ -473,24 +553,41 @@ def main() -> None:
     seeds = [int(seed) for seed in given.seeds.split(",")]
     rows = json.loads(RESULTS.read_text("utf-8")) if RESULTS.exists() else []
     match given.what:
+        case ["train", arm] if arm == LEARNED:
+            learn_message(seeds, given.trained)
+            return
         case ["train", arm] if arm in ARMS:
             train_arm(arm, seeds, given.trained)
             return
         case ["judge"]:
-            every = (*LAWS, *(name for name in ARMS if (given.trained / name).exists()))
+            trained = [name for name in (LEARNED, *ARMS) if (given.trained / name).exists()]
+            every = (BASE, *BY_HAND, *trained)
             for name in (given.only,) if given.only else every:
                 rows = joined(rows, judge_arm(name, seeds, given.trained))
                 keep(rows)
+        case ["courses"]:
+            kept = [row for row in rows if row["cell"] != "training" or row["arm"] not in ARMS]
+            rows = kept + [one for name in ARMS for one in trainings(name, given.trained)]
+            keep(rows)
         case ["probe"]:
             rows = joined(rows, probe())
             keep(rows)
         case []:
             pass
         case _:
-            parser.error(f"{' '.join(given.what)!r} is none of train ARM, judge, probe")
+            parser.error(f"{' '.join(given.what)!r} is none of train ARM, judge, courses, probe")
     for name, text in tables(rows).items():
         put(PAGE, text, name)
     draw(rows, PICTURE)
+    courses = [row for row in rows if row["cell"] == "training" and "along" in row]
+    draw_courses(
+        courses,
+        COURSES_DRAWN,
+        COURSES,
+        along="robot steps, millions",
+        values="mean reward of a rollout",
+        scale=MILLION,
+    )
 
 
 if __name__ == "__main__":

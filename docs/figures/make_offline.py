@@ -1,8 +1,8 @@
 """Offline learning from the data of a good and a mediocre controller, against both and against imitation.
 
-Writes ``docs/learning/offline.json`` and the tables of the section *Offline learning* of
+Writes ``docs/learning/offline.json``, and tables and figure of the section *Offline learning* of
 ``docs/learning.md``. It needs the extras ``train`` and ``data``. ``python docs/figures/make_offline.py`` makes
-the tables from the file. Before that, in this order:
+tables and figure from the file. Before that, in this order:
 
 ``data`` trains the mediocre controller and drives both, with noise on the actions of the mediocre one.
 
@@ -20,11 +20,15 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
+from make_algorithms import MILLION, Entry, draw_scores
 from make_board import DOCS
+from make_figures import BLUE, ORANGE, STYLE
 from make_memory import difference, held_mm
 from make_parts import put
 from make_speed import table
+from matplotlib.figure import Figure
 
 from baselines.commands.export import export_command
 from baselines.policies.registry import fit_policy
@@ -38,12 +42,14 @@ from tlf_env.common.files import atomic
 from tlf_env.task.scenario import load_scenario
 
 PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "offline.json"
+PICTURE = DOCS / "learning" / "offline.png"
 MADE = Path("results/offline")
 GOOD, MEDIOCRE = "from-nothing", "mediocre"
 MEDIOCRE_STEPS = 1_000_000  # of the training `from-nothing`, in place of 7.5 M
 DISTURBANCES = "nominal,slip,start,ice,combined-hard"
 DATA_TASKS, DATA_SEEDS, DATA_HORIZON_S = "infinity", "0:4", 60.0
 NOISE = 0.3  # on the actions of the mediocre controller
+DRAWN = (Entry("imitation", "imitation", ORANGE, "--"), Entry("offline", "TD3+BC", BLUE, "-"))
 ARMS = {"imitation": 0.0, "offline": None}  # α; None: the preset's
 HORIZON_S = 60.0
 CELLS = (
@@ -185,6 +191,24 @@ def trained_table(rows: list[dict[str, Any]]) -> str:
     return table(["training", "seed", "kept", "failed", "at steps drawn", "minutes"], out)
 
 
+def draw(rows: list[dict[str, Any]], path: Path) -> None:
+    """Draw the score of each arm against the steps drawn: median and range of the training seeds."""
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(5.0, 3.2), layout="constrained")
+        panel = figure.subplots()
+        every = config_of("offline").evaluation.every
+        for entry in DRAWN:
+            scores = np.array([row["score_mm"] for row in rows if row["arm"] == entry.name])
+            draw_scores(panel, np.arange(scores.shape[1]) * every / MILLION, scores, entry)
+        panel.set(
+            xlabel="robot steps drawn from the data, millions",
+            ylabel="score on validation seeds, mm",
+            yscale="log",
+        )
+        panel.legend(fontsize="small")
+        figure.savefig(path, dpi=110)
+
+
 def train_arm(arm: str, seeds: Sequence[int]) -> None:
     """Train an arm with some seeds, one after another."""
     for seed in seeds:
@@ -223,6 +247,7 @@ def main() -> None:
             parser.error(f"{' '.join(given.what)!r} is none of data, train ARM, judge")
     put(PAGE, trained_table(kept["trainings"]), "offline trainings")
     put(PAGE, judged_table(kept["judged"]), "offline")
+    draw(kept["trainings"], PICTURE)
 
 
 if __name__ == "__main__":

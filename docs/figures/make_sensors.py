@@ -1,9 +1,9 @@
-"""Policies from raw sensors to wheel speeds: the table of the section *Raw sensors* of ``docs/learning.md``.
+"""Policies from raw sensors to wheel speeds: table and figure of *Raw sensors* in ``docs/learning.md``.
 
 ``python docs/figures/make_sensors.py`` drives every policy of ``results/train/sensors`` (made by
 ``tlf train sensors --seeds 0,1,2``) on seeds that nothing was tuned on, keeps what it finds in
-``docs/learning/sensors.json`` by the digest of the policy's file, and makes the table; ``--kept`` makes it from
-that file alone. The nominal ∞ has 100 runs, the other columns 30.
+``docs/learning/sensors.json`` by the digest of the policy's file, and makes table and figure; ``--kept`` makes
+them from that file alone. The nominal ∞ has 100 runs, the other columns 30.
 """
 
 from __future__ import annotations
@@ -14,17 +14,22 @@ import json
 from pathlib import Path
 from typing import Any
 
+import matplotlib
 import numpy as np
-from make_algorithms import CELLS, drive
+from make_algorithms import CELLS, MILLION, Entry, draw_scores, drive
 from make_board import DOCS
+from make_figures import BLUE, STYLE
 from make_parts import put
 from make_speed import table
+from matplotlib.figure import Figure
 
 from baselines.runs.seed_ranges import FIRST_TABLE_SEED
 from tlf_env.common.files import atomic
 
 PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "sensors.json"
+PICTURE = DOCS / "learning" / "sensors.png"
 TRAINED = Path("results/train/sensors")
+BOARD, ON_BOARD = Path("results/board-sensors/leaderboard.json"), "seed_0"  # and whose it is
 DEFAULT = "reference:linearised"
 NOMINAL, NOMINAL_RUNS, RUNS = "∞, nominal", 100, 30
 
@@ -48,10 +53,20 @@ def of_training(folder: Path) -> dict[str, Any]:
     return {
         "imitated_mm": first["score_mm"],
         "ended_mm": last["score_mm"],
+        "course": [[one["robot_steps"], one["score_mm"]] for one in curve["evaluations"]],
         "kept_mm": kept["score_mm"],
         "kept_at": kept["robot_steps"],
         "minutes": curve["wall_time_s"] / 60,
     }
+
+
+def on_board(leaderboard: dict[str, Any]) -> dict[str, Any]:
+    """Score and failures of the policy on the benchmark's plan ``board``."""
+    (mine,) = leaderboard["policies"]
+    lost = {
+        f"{one['task']}, {one['disturbance']}": one["lost"]["count"] for one in leaderboard["cells"]
+    }
+    return {"score": mine["score"], "runs": mine["runs"], "failed": mine["failed"], "lost": lost}
 
 
 def shown(cell: dict[str, Any]) -> str:
@@ -61,6 +76,12 @@ def shown(cell: dict[str, Any]) -> str:
     lost = len(cell["failed"])
     median = f"{np.median(held):.2f}" if held else "–"
     return f"{median} ({lost})" if lost else median
+
+
+def keep(found: dict[str, Any]) -> None:
+    """Write what was found."""
+    with atomic(RESULTS, encoding="utf-8") as file:
+        json.dump(found, file)
 
 
 def judged_table(kept: dict[str, Any]) -> str:
@@ -82,6 +103,23 @@ def judged_table(kept: dict[str, Any]) -> str:
     return table(["", *CELLS, "imitation", "kept", "minutes"], rows)
 
 
+def draw(kept: dict[str, Any], path: Path) -> None:
+    """Draw the score while PPO goes on after the imitation: median and range of the training seeds."""
+    courses = np.array([one["training"]["course"] for one in kept.values() if "training" in one])
+    with matplotlib.rc_context(STYLE):
+        figure = Figure(figsize=(5.0, 3.2), layout="constrained")
+        panel = figure.subplots()
+        steps, scores = courses[0, :, 0], courses[:, :, 1]
+        draw_scores(panel, steps / MILLION, scores, Entry("sensors", "PPO, `sensors`", BLUE))
+        panel.set(
+            xlabel="robot steps of PPO after the imitation, millions",
+            ylabel="score on validation seeds, mm",
+        )
+        panel.set_ylim(bottom=0.0)
+        panel.legend(fontsize="small")
+        figure.savefig(path, dpi=110)
+
+
 def main() -> None:
     """Drive what is new, and make the table."""
     parser = argparse.ArgumentParser(description=__doc__)
@@ -97,14 +135,14 @@ def main() -> None:
             path = folder / "policy.safetensors"
             digest = hashlib.sha256(path.read_bytes()).hexdigest()
             if kept.get(folder.name, {}).get("digest") != digest:
-                kept[folder.name] = {
-                    "digest": digest,
-                    "training": of_training(folder),
-                    "cells": judged(str(path)),
-                }
-                with atomic(RESULTS, encoding="utf-8") as file:
-                    json.dump(kept, file)
+                kept[folder.name] = {"digest": digest, "cells": judged(str(path))}
+            kept[folder.name]["training"] = of_training(folder)
+            keep(kept)
+        if BOARD.is_file():
+            kept[ON_BOARD]["board"] = on_board(json.loads(BOARD.read_text(encoding="utf-8")))
+            keep(kept)
     put(PAGE, judged_table(kept), "sensors")
+    draw(kept, PICTURE)
 
 
 if __name__ == "__main__":

@@ -77,14 +77,15 @@ def machine(result: dict[str, Any]) -> str:
 def speeds(result: dict[str, Any]) -> str:
     """Agent steps per second of all environments."""
     body = []
-    for env in (ALONE, VECTOR, VMAS, MPE2):
+    special = {row["env"]: None for row in result["results"] if row["env"].startswith(f"{VECTOR},")}
+    for env in (ALONE, VECTOR, *special, VMAS, MPE2):
         for row in rows_of(result, env):
             spread = (
                 f"({number(row['min'] * row['robots'])} … {number(row['max'] * row['robots'])})"
             )
             body.append(
                 [
-                    f"`{env}`",
+                    f"`{VECTOR}`{env.removeprefix(VECTOR)}" if env in special else f"`{env}`",
                     str(row["robots"]),
                     str(row["formations"]),
                     str(row["threads"]),

@@ -206,13 +206,26 @@ class RowPolicy:
         return actions, state
 
 
+class Weights(NamedTuple):
+    """What a message of two numbers is made of, and what is done with it, each forward and to the right."""
+
+    sent: tuple[float, float]  # of the own error
+    relayed: tuple[float, float]  # of the message that was received one gap ago
+    applied: tuple[float, float]  # of that message, in the correction
+
+
+ALL, NONE = (1.0, 1.0), (0.0, 0.0)
+OWN_ERROR = Weights(sent=ALL, relayed=NONE, applied=ALL)
+CORRECTED_ERROR = Weights(sent=ALL, relayed=ALL, applied=ALL)
+
+
 class CorrectingPolicy:
-    """A law on ``tracking`` observations, whose robots send their errors to their successors.
+    """A law on ``tracking`` observations, whose robots send two numbers to their successors.
 
     A follower's reference is where its predecessor was one gap ago, so it repeats its predecessor's error of
-    that time. Here it adds this error to its own, and so follows its predecessor's reference. With relayed
-    messages that error is the corrected one, and all robots follow the leader's reference. The headings of both
-    robots at that place are taken to be the same.
+    that time. Here it adds what it received at that time to its own error. If that is the predecessor's error,
+    it follows its predecessor's reference. If it is the predecessor's corrected error, all robots follow the
+    leader's reference. The headings of both robots at that place are taken to be the same.
 
     Parameters
     ----------
@@ -220,12 +233,12 @@ class CorrectingPolicy:
         A law without a state.
     scenario
         Of the run.
-    relayed
-        Whether a robot sends its corrected error, or its own.
+    weights
+        What is sent, and what is done with it.
     """
 
-    def __init__(self, policy: Policy, scenario: Scenario, relayed: bool) -> None:
-        self._policy, self._scenario, self._relayed = policy, scenario, relayed
+    def __init__(self, policy: Policy, scenario: Scenario, weights: Weights) -> None:
+        self._policy, self._scenario, self._weights = policy, scenario, weights
         names = entry_names(scenario)
         self._places = [names.index(name) for name in ERROR]
         self._scales_mm = np.array([TRACKING_ENTRIES[name].scale for name in ERROR])
@@ -250,7 +263,8 @@ class CorrectingPolicy:
         heard_mm = np.clip(ahead(state.ago(steps), leaders), -MOST_MM, MOST_MM)
         own_mm = observation[:, self._places[:2]] * self._scales_mm[:2]
         corrected = observation.copy()
-        corrected[:, self._places] += np.tile(heard_mm, 2) / self._scales_mm
+        sent, relayed, applied = map(np.array, self._weights)
+        corrected[:, self._places] += np.tile(applied * heard_mm, 2) / self._scales_mm
         actions, _ = self._policy.predict(corrected, None, episode_start, deterministic)
-        state.note(own_mm + heard_mm if self._relayed else own_mm)
+        state.note(sent * own_mm + relayed * heard_mm)
         return actions, state

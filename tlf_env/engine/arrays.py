@@ -42,6 +42,18 @@ from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario
 
+# Arrays that follow from the scenario alone, or (``tables``) from it and the phase of a start.
+FROM_SCENARIO = (
+    "signals",
+    "patches",
+    "walls",
+    "rays",
+    "tables",
+    "scales",
+    "sensor_scales",
+    "weights",
+    "previews",
+)
 FEW_LANES = 64
 DOUBLES_PER_CACHE_LINE = 8
 FAR_AWAY = PatchRow(x=math.inf, y=0.0, radius=0.0, scale=1.0)  # no robot is ever on it

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 import secrets
 from collections.abc import Mapping, Sequence
@@ -18,6 +19,14 @@ from tlf_env.engine.excerpt import Excerpt, empty_excerpt
 from tlf_env.engine.formation import NO_POSES, reference_table, refusal
 from tlf_env.engine.outside_base import make_base, separate_base
 from tlf_env.engine.settings import make_settings
+from tlf_env.engine.snapshot import (
+    Snapshot,
+    array_numbers,
+    checked_arrays,
+    checked_snapshot,
+    put_arrays,
+    scenario_facts,
+)
 from tlf_env.engine.starting import STARTED
 from tlf_env.numerics.compiled import compile_for
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
@@ -29,6 +38,7 @@ from tlf_env.task.warn import warn_of
 
 Source = str | Path | Mapping[str, Any] | Scenario
 
+KIND = "BatchPlant"
 MAY_DIFFER = ("name", "robots", "robot", "wheel_loop", "ekf", "ekf_slip", "ekf_gyro", "disturbance")
 
 
@@ -172,16 +182,8 @@ class BatchPlant:
             self.arrays.routes[chosen] = 0
             return
         phases_s = np.where(chosen, start.phases_s, self._phases_s[self.arrays.routes])
-        known = dict(zip(self._phases_s.tolist(), self.arrays.tables, strict=True))
         later = np.unique(phases_s[phases_s != 0.0])
-        self._phases_s = np.array([0.0, *later])  # of the tables; the first has none
-        tables = [
-            reference_table(self.scenario, phase_s)
-            if known.get(phase_s) is None
-            else known[phase_s]
-            for phase_s in self._phases_s
-        ]
-        self.arrays = self.arrays._replace(tables=np.array(tables))
+        self._follow_from(np.array([0.0, *later]))
         self.arrays.routes[:] = np.where(phases_s == 0.0, 0, 1 + np.searchsorted(later, phases_s))
 
     def set_shares(self, mixture: bool | Sequence[float]) -> None:
@@ -344,6 +346,96 @@ class BatchPlant:
         if self._pool is None or self._pool_pid != os.getpid():
             self._pool, self._pool_pid = ThreadPoolExecutor(self.threads - 1), os.getpid()
         return self._pool
+
+    def get_state(self) -> Snapshot:
+        """Everything that the next steps depend on; :meth:`set_state` goes back to it, bit for bit.
+
+        Raises
+        ------
+        RuntimeError
+            before the first :meth:`reset`.
+        ValueError
+            in one line, for a policy as ``residual_base`` whose state cannot be read: see
+            :mod:`tlf_env.onboard.memory`.
+        """
+        if not self._seeded.any():
+            raise RuntimeError("call reset() before get_state()")
+        numbers = array_numbers(self.arrays)
+        numbers |= {
+            "batch/seeded": self._seeded.copy(),
+            "batch/phases_s": self._phases_s.copy(),
+            "batch/poses": self._poses.copy(),
+            "batch/mixture": self._variants.mixture.copy(),
+        }
+        memory = {} if self._base is None else {"base": self._base.get_state(numbers)}
+        return Snapshot(KIND, self._facts, memory, numbers)
+
+    @functools.cached_property
+    def _facts(self) -> dict[str, Any]:
+        """What must be equal where a snapshot is put back."""
+        return {
+            "formations": self.formations,
+            "scenarios": [scenario_facts(one) for one in self.scenarios],
+            "mixture": bool(len(self._variants.mixture)),
+            "staggered": self._first_ends is not None,
+        }
+
+    def set_state(self, state: Snapshot) -> None:
+        """Go back to a moment of this plant, or of another one that was made with the same arguments.
+
+        The number of threads may differ.
+
+        Raises
+        ------
+        TypeError
+            for anything but a :class:`~tlf_env.engine.snapshot.Snapshot`.
+        ValueError
+            in one line that names the first difference, for a state that does not fit, or that is damaged.
+            Then nothing has changed, unless the ``set_state`` of a policy raised an error.
+        """
+        checked_snapshot(state).check(KIND, {})
+        self.restore(state)
+
+    def restore(self, state: Snapshot) -> None:
+        """:meth:`set_state` of a snapshot that contains that of a plant."""
+        state.check(state.kind, self._facts)
+        robots, mixture = self.scenario.robot_count, self._variants.mixture
+        given = state.numbers.get("batch/poses", NO_POSES)
+        shape = (self.formations, robots, 3) if len(given) else NO_POSES.shape
+        more = state.part(
+            "batch",
+            {
+                "seeded": (np.bool_, (self.formations,)),
+                "phases_s": (np.float64, (None,)),
+                "poses": (np.float64, shape),
+                "mixture": (np.float64, mixture.shape),
+            },
+            ("poses",),
+        )
+        phases_s, shares = more["phases_s"], more["mixture"]
+        if not len(phases_s) or phases_s[0] != 0.0 or (np.diff(phases_s) == 0.0).any():
+            raise ValueError("the snapshot is damaged: its phases are not those of tables")
+        if len(shares) and (shares[-1] != 1.0 or shares[0] < 0.0 or (np.diff(shares) < 0.0).any()):
+            raise ValueError("the snapshot is damaged: its shares of the scenarios do not sum to 1")
+        counts = len(self.scenarios), len(phases_s)
+        found = checked_arrays(state, self.arrays, self.scenario, counts)
+        if self._base is not None:
+            self._base.set_state(state.tree("base"), state.numbers)
+        self._follow_from(phases_s)
+        put_arrays(self.arrays, found)
+        self._poses, self._seeded[:], mixture[:] = more["poses"].copy(), more["seeded"], shares
+
+    def _follow_from(self, phases_s: np.ndarray) -> None:
+        """Have the tables of the leaders' references from these times on; the first is 0."""
+        known = dict(zip(self._phases_s.tolist(), self.arrays.tables, strict=True))
+        tables = [
+            reference_table(self.scenario, phase_s)
+            if known.get(phase_s) is None
+            else known[phase_s]
+            for phase_s in phases_s.tolist()
+        ]
+        self._phases_s = phases_s.copy()
+        self.arrays = self.arrays._replace(tables=np.array(tables))
 
     @property
     def observations(self) -> np.ndarray:

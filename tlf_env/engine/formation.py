@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping
 from typing import Any
 
@@ -32,6 +33,14 @@ from tlf_env.engine.layout import Traction, rows_of
 from tlf_env.engine.outside_base import make_base
 from tlf_env.engine.outside_parts import Parts, part_factories
 from tlf_env.engine.settings import make_settings
+from tlf_env.engine.snapshot import (
+    Snapshot,
+    array_numbers,
+    checked_arrays,
+    checked_snapshot,
+    put_arrays,
+    scenario_facts,
+)
 from tlf_env.engine.starting import IN_WALL, OFF_BASE, START_ATTEMPTS, STARTED
 from tlf_env.numerics.compiled import compile_for
 from tlf_env.numerics.pointers import packed
@@ -83,6 +92,7 @@ TOUCHED_BY = {
     pymunk.Body.STATIC: int(TouchedBy.WALL),
     pymunk.Body.KINEMATIC: int(TouchedBy.OBSTACLE),
 }
+KIND = "Formation"
 USUAL_START = Start(poses=None, phases_s=None)
 ALONE = np.ones(1, dtype=np.bool_)
 FIRST_LANE = np.zeros(1, dtype=np.int64)
@@ -117,6 +127,7 @@ class Formation:
         self._packed_arrays, self._packed_of = packed(self.arrays), self.arrays
         self._compiled = False
         self._has_rays = scenario.rays is not None
+        self._phase_s = 0.0  # of the leader's reference in this episode
         self._left = drivers.lanes_to_step(0, 1)
         self._nothing = empty_excerpt(self.arrays, 0, 0)
 
@@ -150,8 +161,7 @@ class Formation:
             self._compile()
         arrays, settings = self.arrays, self._settings
         arrays.clock[0], arrays.seeds[0] = (0, 0, episode, self.scenario.horizon_steps), seed
-        phase_s = 0.0 if start.phases_s is None else float(start.phases_s[0])
-        arrays.tables[0] = reference_table(self.scenario, phase_s) if phase_s else self._table
+        self._follow_from(0.0 if start.phases_s is None else float(start.phases_s[0]))
         poses = NO_POSES if start.poses is None else start.poses
         result, robot, _ = drivers.start(self._given(), self._variants, ALONE, poses, self._packed)
         if result != STARTED:
@@ -165,6 +175,83 @@ class Formation:
         self._do(drivers.LOOK_AT_START)
         if self._has_rays:
             self._look_at_objects()
+
+    def _follow_from(self, phase_s: float) -> None:
+        """Let the leader follow its trajectory from a time on."""
+        table = reference_table(self.scenario, phase_s) if phase_s else self._table
+        self.arrays.tables[0] = table
+        self._phase_s = phase_s
+
+    def get_state(self) -> Snapshot:
+        """Everything that the next steps depend on; :meth:`set_state` goes back to it, bit for bit.
+
+        The formation goes on as if it had not been asked.
+
+        Raises
+        ------
+        RuntimeError
+            before the first :meth:`reset`.
+        ValueError
+            in one line that names it, for a part or a policy whose state cannot be read: see
+            :mod:`tlf_env.onboard.memory`.
+        """
+        if not self.arrays.clock[0, 3]:
+            raise RuntimeError("call reset() before get_state()")
+        numbers = array_numbers(self.arrays)
+        memory = {"phase_s": self._phase_s, "parts": self._parts.get_state(numbers)}
+        if self._base is not None:
+            memory["base"] = self._base.get_state(numbers)
+        numbers |= {f"space/{name}": array for name, array in self.plant.get_state().items()}
+        return Snapshot(KIND, self._facts(), memory, numbers)
+
+    def _facts(self) -> dict[str, Any]:
+        """What must be equal where a snapshot is put back."""
+        return {"scenario": self._scenario_facts, "space": self.plant.structure()}
+
+    @functools.cached_property
+    def _scenario_facts(self) -> dict[str, Any]:
+        return scenario_facts(self.scenario)
+
+    def set_state(self, state: Snapshot) -> None:
+        """Go back to a moment of this formation, or of another one of the same scenario.
+
+        Objects that a user has added to the space must be there, in the same order; they go back, too.
+        Parts in Python are made again and get their states.
+
+        Raises
+        ------
+        TypeError
+            for anything but a :class:`~tlf_env.engine.snapshot.Snapshot`.
+        ValueError
+            in one line that names the first difference, for a state that does not fit, or that is damaged.
+            Then nothing has changed, unless the ``set_state`` of a policy raised an error.
+        """
+        checked_snapshot(state).check(KIND, {})
+        self.restore(state)
+
+    def restore(self, state: Snapshot) -> None:
+        """:meth:`set_state` of a snapshot that contains that of a formation."""
+        state.check(state.kind, self._facts())
+        if not self._compiled:
+            self._compile()
+        arrays, phase_s = self.arrays, state.tree("phase_s")
+        if not isinstance(phase_s, float):
+            raise ValueError(f"the snapshot is damaged: its phase is {shown(phase_s)}")
+        found = checked_arrays(state, arrays, self.scenario, (1, 1))
+        space = state.part("space", self.plant.state_layout())
+        try:
+            self.plant.check_state(space)
+        except ValueError as error:
+            raise ValueError(f"the snapshot is damaged: {error}") from error
+        parts = self._parts.restored(
+            state.tree("parts"), state.numbers, found["constants"], found["states"]
+        )
+        if self._base is not None:
+            self._base.set_state(state.tree("base"), state.numbers)
+        put_arrays(arrays, found)
+        self._follow_from(phase_s)
+        self.plant.set_state(space, arrays.rows("body")[:, :, 0])
+        self._parts.go_on(parts)
 
     def impose(self, values: Mapping[str, float | np.ndarray]) -> None:
         """Set channels for the coming control step: ``{path: value or one per robot}``.

@@ -10,6 +10,7 @@ import numpy as np
 
 from tlf_env.common.errors import shown
 from tlf_env.engine.arrays import Arrays
+from tlf_env.onboard.memory import caller_state, give_caller_state
 from tlf_env.onboard.parts import Policy, load_part, make_part, part_name, predicted
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.scenario import Scenario
@@ -59,6 +60,31 @@ class OutsideBase:
         self._name, self._policy = name, policy
         self._state: Any = None
 
+    @property
+    def what(self) -> str:
+        """Role and name, for errors."""
+        return f"{ROLE} {self._name!r}"
+
+    def get_state(self, numbers: dict[str, np.ndarray]) -> Any:
+        """What the policy remembers, as JSON values, its arrays in ``numbers``.
+
+        Raises
+        ------
+        ValueError
+            in one line that names the policy, if its state is not plain.
+        """
+        return caller_state(self._policy, self.what, "base", numbers, self._state)
+
+    def set_state(self, tree: Any, numbers: Mapping[str, np.ndarray]) -> None:
+        """Go on from a state of :meth:`get_state`.
+
+        Raises
+        ------
+        ValueError
+            in one line that names the policy, if it does not take its state.
+        """
+        self._state = give_caller_state(self._policy, tree, self.what, numbers)
+
     def command(self, arrays: Arrays) -> None:
         """Write the twists of all robots in all formations, as actions, for the coming step.
 
@@ -70,10 +96,9 @@ class OutsideBase:
         lanes, robots, entries = arrays.observations.shape
         starts = np.repeat(arrays.clock[:lanes, 1] == 0, robots)
         seen = arrays.observations.reshape(-1, entries).copy()
-        what = f"{ROLE} {self._name!r}"
         answer = self._policy.predict(seen, self._state, starts, True)
-        actions, state = predicted(answer, (len(seen), ACTION_SIZE), what)
+        actions, state = predicted(answer, (len(seen), ACTION_SIZE), self.what)
         if not np.isfinite(actions).all():
-            raise ValueError(f"{what}: the actions must be finite, got {shown(actions)}")
+            raise ValueError(f"{self.what}: the actions must be finite, got {shown(actions)}")
         arrays.twists[:] = np.clip(actions, -1.0, 1.0).reshape(arrays.twists.shape)
         self._state = state

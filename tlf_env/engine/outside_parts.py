@@ -9,9 +9,11 @@ import numpy as np
 
 from tlf_env.engine import drivers
 from tlf_env.engine.arrays import Arrays
-from tlf_env.engine.layout import Sample, Trace
+from tlf_env.engine.layout import Sample, Trace, rows_of
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.pointers import packed
+from tlf_env.onboard.calibration import Belief
+from tlf_env.onboard.memory import give_state, state_of
 from tlf_env.onboard.parts import (
     Factory,
     Readings,
@@ -26,6 +28,8 @@ from tlf_env.physics.vehicle import RobotParameters
 from tlf_env.task.actions import TORQUE
 from tlf_env.task.scenario import Scenario
 
+AXLE = Belief._fields.index("h")
+RADII = [Belief._fields.index(name) for name in ("radius_l", "radius_r")]
 COVARIANCE = np.triu_indices(3)  # its order in an Estimate, after the pose
 SLIP = [SlipEstimate._fields.index(name) for name in ("delta_1", "delta_2")]
 ODOMETRY = [Trace._fields.index(name) for name in ("distance", "turn")]
@@ -66,7 +70,8 @@ class Parts:
             "observer": scenario.control_period_s,
         }
         self._made: dict[str, list[Any]] = {}
-        self._packed: Any = None  # arrays and settings of the episode, for drivers
+        self._packed: Any = None  # the last arrays and settings, as drivers take them
+        self._packed_of: Arrays | None = None
         self._radii = np.ones((len(self._robots), 2))  # of the wheels, believed over true
         self._holds: list[int] = []  # substeps for which the last command still holds
         self._odometry = self._moved = np.zeros((2, 0))  # (mm and rad, robot) in this control step
@@ -79,40 +84,107 @@ class Parts:
         ValueError
             for a factory that makes no part of its role.
         """
-        self._packed = packed(arrays), packed(settings)
-        belief = arrays.named("belief")
-        self._radii = np.stack([belief.radius_l[:, 0], belief.radius_r[:, 0]], axis=1)
+        self._radii, self._made = self._started(arrays.constants, arrays.states)
+        for robot in range(1, len(self._of("observer"))):
+            for step in range(settings.lookahead + 1):
+                self._observe_one(arrays, settings, robot, step)
+
+    def _started(
+        self, constants: np.ndarray, states: np.ndarray
+    ) -> tuple[np.ndarray, dict[str, list[Any]]]:
+        """Wheel radii, and new parts at the start of the episode with these rows of the engine's arrays."""
+        belief, starts = (
+            rows_of(array, name)[:, :, 0]
+            for array, name in ((constants, "belief"), (states, "start"))
+        )
         robots = [
-            with_axle_width(robot, 2.0 * float(h))
-            for robot, h in zip(self._robots, belief.h[:, 0], strict=True)
+            with_axle_width(robot, 2.0 * h)
+            for robot, h in zip(self._robots, belief[AXLE].tolist(), strict=True)
         ]
-        self._made = {
+        made = {
             role: [
                 make_part(role, self._names[role], factory, robot, self._periods[role])
                 for robot in robots
             ]
             for role, factory in self._factories.items()
         }
-        starts = arrays.rows("start")[:, :, 0]
-        for estimator, pose in zip(self._of("estimator"), starts.T, strict=False):
+        for estimator, pose in zip(made.get("estimator", []), starts.T, strict=False):
             estimator.reset(pose.copy())
-        for loop in self._of("wheel_loop"):
+        for loop in made.get("wheel_loop", []):
             loop.reset()
-        for robot, observer in enumerate(self._of("observer")):
-            if robot > 0:
-                observer.reset(starts[:, robot].copy())
-                for step in range(settings.lookahead + 1):
-                    self._observe_one(arrays, settings, robot, step)
+        for observer, pose in zip(made.get("observer", [])[1:], starts.T[1:], strict=False):
+            observer.reset(pose.copy())
+        return belief[RADII].T.copy(), made
+
+    def get_state(self, numbers: dict[str, np.ndarray]) -> Any:
+        """The states of all parts as JSON values, their arrays in ``numbers``.
+
+        Raises
+        ------
+        ValueError
+            in one line that names the part, for a state that is not plain.
+        """
+        return {
+            role: [
+                state_of(part, self._what(role, robot), f"parts/{role}/{robot}", numbers)
+                for robot, part in enumerate(parts)
+                if self._is_used(role, robot)
+            ]
+            for role, parts in self._made.items()
+        }
+
+    def restored(
+        self,
+        tree: Any,
+        numbers: Mapping[str, np.ndarray],
+        constants: np.ndarray,
+        states: np.ndarray,
+    ) -> tuple[np.ndarray, dict[str, list[Any]]]:
+        """What :meth:`go_on` takes: new parts with the states of :meth:`get_state`; nothing here changes.
+
+        Raises
+        ------
+        ValueError
+            in one line that names the part, if it does not take its state.
+        """
+        radii, made = self._started(constants, states)
+        for role, parts in made.items():
+            used = [robot for robot in range(len(parts)) if self._is_used(role, robot)]
+            trees = tree.get(role) if isinstance(tree, dict) else None
+            if not isinstance(trees, list) or len(trees) != len(used):
+                raise ValueError(f"the snapshot is damaged: it has no states for each {role}")
+            for robot, one in zip(used, trees, strict=True):
+                give_state(parts[robot], one, self._what(role, robot), numbers)
+        return radii, made
+
+    def go_on(self, restored: tuple[np.ndarray, dict[str, list[Any]]]) -> None:
+        """Go on with the parts that :meth:`restored` has made."""
+        self._radii, self._made = restored
+
+    def _what(self, role: str, robot: int) -> str:
+        return f"{role.replace('_', ' ')} {self._names[role]!r} of robot_{robot}"
+
+    @staticmethod
+    def _is_used(role: str, robot: int) -> bool:
+        """Whether a part is ever called: the leader's observer is not."""
+        return role != "observer" or robot > 0
 
     def _of(self, role: str) -> list[Any]:
         return self._made.get(role, [])
+
+    def _given(self, arrays: Arrays, settings: Settings) -> tuple[Arrays, Settings]:
+        """Both as drivers take them; packed again if the arrays are others than last time."""
+        if self._packed_of is not arrays:
+            self._packed, self._packed_of = (packed(arrays), packed(settings)), arrays
+        given: tuple[Arrays, Settings] = self._packed
+        return given
 
     def drive(self, arrays: Arrays, substep: int, settings: Settings) -> None:
         """Wheel loops: put torques in the place of the commands; the row ``wanted`` keeps those."""
         for robot, loop in enumerate(self._of("wheel_loop")):
             if arrays.kinds[robot, 0] == TORQUE:
                 continue
-            _, hold = drivers.delays_of(self._packed[0], 0, robot, settings.dt)
+            _, hold = drivers.delays_of(self._given(arrays, settings)[0], 0, robot, settings.dt)
             row = "wanted_before" if substep < hold else "wanted"
             wanted = arrays.rows(row)[:, robot, 0].copy()
             sensors = arrays.named("sensors")
@@ -129,7 +201,7 @@ class Parts:
             return
         if substep == 0:
             self._holds = [
-                drivers.delays_of(self._packed[0], 0, robot, settings.dt)[1]
+                drivers.delays_of(self._given(arrays, settings)[0], 0, robot, settings.dt)[1]
                 for robot in range(len(estimators))
             ]
             self._odometry, self._moved = np.zeros((2, 2, len(estimators)))
@@ -179,7 +251,7 @@ class Parts:
             self._observe_one(arrays, settings, robot, int(arrays.clock[0, 1]) + settings.lookahead)
 
     def _observe_one(self, arrays: Arrays, settings: Settings, robot: int, step: int) -> None:
-        given, numbers = self._packed
+        given, numbers = self._given(arrays, settings)
         message = drivers.delayed_message_of(given, 0, robot, step, numbers)
         reference = self._made["observer"][robot].update(message, step * settings.period)
         row = finite(reference, 5, f"robot_{robot}: the observer's update()")

@@ -20,8 +20,10 @@ from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, stat
 from tlf_env.engine.judging import TERMINATES, TRUNCATES
 from tlf_env.engine.outside_base import separate_base
 from tlf_env.engine.readout import info_rows
+from tlf_env.engine.snapshot import Snapshot, checked_generator, checked_snapshot
 from tlf_env.envs.spec import documented
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
+from tlf_env.onboard.memory import caller_state, give_caller_state
 from tlf_env.onboard.parts import Factory, part_name, real_numbers
 from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE
@@ -34,6 +36,7 @@ from tlf_env.task.warn import warn_of
 
 Agent = str
 Adversary = Callable[["FormationParallelEnv"], Mapping[str, float | np.ndarray]]
+KIND, ADVERSARY = "FormationParallelEnv", "adversary"
 PETTINGZOO_TEST_OPTION = "options"  # PettingZoo's API test passes this option; it is ignored
 
 
@@ -234,6 +237,78 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self.agents = list(self.possible_agents)
         return self._observations(), self._infos()
 
+    def get_state(self) -> Snapshot:
+        """Everything that the future depends on, at this moment; the environment goes on unchanged.
+
+        At any time, after the end of an episode too. The snapshot does not change with later steps.
+        :meth:`~tlf_env.engine.snapshot.Snapshot.save` writes it to a file. Not in it: the random generators of
+        the spaces, what is drawn, and the functions that you add to bodies, constraints and collisions.
+
+        Raises
+        ------
+        RuntimeError
+            before the first :meth:`reset`.
+        ValueError
+            in one line that names it, for a part, a policy or an adversary whose state cannot be read.
+        """
+        if self._seed is None:
+            raise RuntimeError("call reset() before get_state()")
+        numbers: dict[str, np.ndarray] = {}
+        memory = {
+            "over": not self.agents,
+            "seed": self._seed,
+            "episode": self._episode,
+            "random": self._np_random,
+        }
+        adversary = caller_state(self._adversary, ADVERSARY, "adversary", numbers)
+        inner = self._formation.get_state()
+        return inner.within(KIND, {}, memory, {"adversary": adversary}, numbers)
+
+    def set_state(
+        self, state: Snapshot
+    ) -> tuple[dict[Agent, np.ndarray], dict[Agent, dict[str, Any]]]:
+        """Go back to a moment of :meth:`get_state`; all that follows is the same, bit for bit.
+
+        Also a moment of another environment that was made with the same arguments, or of another process
+        (:meth:`Snapshot.load <tlf_env.engine.snapshot.Snapshot.load>`); no :meth:`reset` is needed before.
+        Objects that were added to the space must be there, in the same order.
+
+        Returns
+        -------
+        The observations and infos of that moment, of all robots, as :meth:`reset`.
+
+        Raises
+        ------
+        TypeError
+            for anything but a :class:`~tlf_env.engine.snapshot.Snapshot`.
+        ValueError
+            in one line that names the first difference, for a state that does not fit, or that is damaged.
+            Then nothing has changed, unless the ``set_state`` of a policy or an adversary raised an error.
+        """
+        checked_snapshot(state).check(KIND, {})
+        self.restore(state)
+        return self.now()
+
+    def now(self) -> tuple[dict[Agent, np.ndarray], dict[Agent, dict[str, Any]]]:
+        """The observations and infos of this moment, of all robots."""
+        return self._observations(), self._infos(afresh=True)
+
+    def restore(self, state: Snapshot) -> None:
+        """:meth:`set_state` of a snapshot that contains that of a parallel environment."""
+        over, episode = state.recall("over"), state.recall("episode")
+        generator = checked_generator(state.recall("random"))
+        seed = checked_seed(state.recall("seed"))
+        if type(over) is not bool or type(episode) is not int or episode < 0:
+            raise ValueError("the snapshot is damaged: its episode is none")
+        self._formation.restore(state)
+        give_caller_state(self._adversary, state.tree("adversary"), ADVERSARY, state.numbers)
+        self.agents = [] if over else list(self.possible_agents)
+        self._seed, self._episode, self._np_random = seed, episode, generator
+        if self._renderer is not None:
+            self._renderer.begin(self._path_mm())
+        if self.render_mode == "human":
+            self._draw(self.render_mode)
+
     def step(
         self, actions: dict[Agent, np.ndarray]
     ) -> tuple[
@@ -318,11 +393,11 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         fresh = self._seen().copy()
         return dict(zip(self.possible_agents, fresh, strict=True))
 
-    def _infos(self) -> dict[Agent, dict[str, Any]]:
+    def _infos(self, *, afresh: bool = False) -> dict[Agent, dict[str, Any]]:
         keys, pick, arrays = self._info_keys, self._pick, self._formation.arrays
         if not keys:
             return {agent: {} for agent in self.possible_agents}
-        if self._formation.step_count and len(keys) == len(INFO_KEYS):
+        if self._formation.step_count and not afresh and len(keys) == len(INFO_KEYS):
             changed = info_rows(arrays, channels=self._varying)
             named = {}
             for agent, first, row in zip(

@@ -12,14 +12,17 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from tlf_env.engine.snapshot import Snapshot, checked_generator, checked_snapshot
 from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.envs.spec import documented
-from tlf_env.onboard.parts import Policy, load_part, make_part, predicted
+from tlf_env.onboard.memory import caller_state, give_caller_state
+from tlf_env.onboard.parts import Policy, load_part, make_part, part_name, predicted
 from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE, TWIST
 from tlf_env.task.info import InfoChoice
 from tlf_env.task.scenario import Scenario, learners_action
 
+KIND, OTHERS = "FormationEnv", "policy of the other robots"
 BY_REFERENCE = "reference"
 
 
@@ -113,6 +116,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         self.action_space = self.formation_env.action_space(learner)
         self._rest = [i for i, agent in enumerate(agents) if agent != learner]
         self._driver = self._make_driver(others)
+        self._others = others if isinstance(others, str) else part_name(type(others))
         self._driver_state: Any = None
         kinds = self.formation_env.formation.arrays.kinds
         kinds[self._rest] = self.scenario.reference_kind if self._driver is None else TWIST
@@ -149,6 +153,43 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         observations, infos = self.formation_env.reset(seed=seed, options=options)
         self._driver_state = None
         self._driver_start[:] = True
+        return observations[self.learner], infos[self.learner]
+
+    def get_state(self) -> Snapshot:
+        """Everything that the future depends on, as :meth:`FormationParallelEnv.get_state`.
+
+        Of ``others`` the state that its ``predict`` returned last, and that of its own ``get_state`` if it
+        has one. The counters of Gymnasium's wrappers are not in it.
+        """
+        numbers: dict[str, np.ndarray] = {}
+        driver = caller_state(self._driver, OTHERS, "others", numbers, self._driver_state)
+        inner = self.formation_env.get_state()
+        memory = {
+            "driver_start": self._driver_start,
+            "own_random": self._np_random,
+            "own_random_seed": self._np_random_seed,
+        }
+        return inner.within(KIND, self._facts(), memory, {"others": driver}, numbers)
+
+    def _facts(self) -> dict[str, Any]:
+        """What must be equal where a snapshot is put back, apart from the formation."""
+        return {"learner": self.learner, "others": self._others}
+
+    def set_state(self, state: Snapshot) -> tuple[np.ndarray, dict[str, Any]]:
+        """Go back to a moment, as :meth:`FormationParallelEnv.set_state`; results are those of the learner."""
+        checked_snapshot(state).check(KIND, self._facts())
+        start = state.recall("driver_start")
+        generator = checked_generator(state.recall("own_random"))
+        seed = state.recall("own_random_seed")
+        if getattr(start, "shape", None) != self._driver_start.shape or start.dtype != np.bool_:
+            raise ValueError("the snapshot is damaged: its driver_start does not fit")
+        env = self.formation_env
+        env.restore(state)
+        tree = state.tree("others")
+        self._driver_state = give_caller_state(self._driver, tree, OTHERS, state.numbers)
+        self._driver_start[:] = start
+        self._np_random, self._np_random_seed = generator, seed
+        observations, infos = env.now()
         return observations[self.learner], infos[self.learner]
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:

@@ -210,6 +210,79 @@ time on its trajectory at which the leader's reference starts, for that episode 
 +y, and positive turns are counter-clockwise (in ROS REP-103, heading 0 points along +x). `state()` is the true
 state, for critics.
 
+## Snapshots
+
+`env.get_state()` returns a `tlf_env.Snapshot` of this moment, and `env.set_state(snapshot)` goes back to it:
+all that follows is the same, bit for bit, in contact and after the end of an episode, too. `set_state`
+returns the observations and infos of that moment, as `reset` does. So several actions can be tried from the
+same moment, as a predictive controller or a tree search does:
+
+```python
+settings = {"disturbance": "slip", "action": "tracking_twist"}
+env = tlf_env.parallel_env("infinity", **settings)
+env.reset(seed=0)
+for _ in range(100):
+    env.step({agent: np.zeros(2) for agent in env.agents})
+moment = env.get_state()
+
+
+def outcome(forward):  # sum of the rewards over half a second
+    env.set_state(moment)
+    steps = [env.step({agent: [forward, 0.0] for agent in env.agents}) for _ in range(25)]
+    return sum(sum(rewards.values()) for _, rewards, *_ in steps)
+
+
+best = max((-0.2, 0.0, 0.2), key=outcome)
+observations, infos = env.set_state(moment)  # and on with the best
+print(best)
+```
+
+```text
+0.2
+```
+
+`save` writes a snapshot to one file, for a long run that is to be resumed, or for a report of a moment at
+which something goes wrong. In another process, `set_state` needs no `reset` before:
+
+```python
+moment.save("moment.safetensors")
+
+again = tlf_env.parallel_env("infinity", **settings)
+observations, infos = again.set_state(tlf_env.Snapshot.load("moment.safetensors"))
+```
+
+```python
+from collections import deque
+
+recent = deque(maxlen=50)  # the last second
+env.reset(seed=0)
+while env.agents:
+    recent.append(env.get_state())
+    *_, infos = env.step({agent: [0.5, 0.0] for agent in env.agents})
+    if any(info["lost"] for info in infos.values()):
+        recent[0].save("before-the-loss.safetensors")
+        break
+```
+
+- `FormationParallelEnv`, `FormationEnv` (`gymnasium.make(...).unwrapped`), `FormationVectorEnv`, `BatchPlant`
+  and `Formation` have both methods, on every plant. A snapshot goes back into an object of the same class
+  that was made with the same arguments; threads, render mode and `infos` may differ. (Gymnasium's wrappers
+  want a `reset` before the first `step`, too.)
+- In it are all states of the engine and of the space (motions, delays, estimators, random processes, contacts
+  with the impulses that they remember, pushed and moving bodies), seed and number of the episode,
+  `np_random`, and the states of [parts and policies of yours](parts.md#snapshots). Not in it are the random
+  generators of the spaces, the counters of wrappers (`TimeLimit`, the AEC conversion), and functions that you
+  give to bodies, constraints or collisions.
+- Objects that you have added to the space go back, too. They must be there in the same order, with the same
+  sizes and masses. (After a wall was removed or moved within an episode, the order in which contacts with
+  several walls at once are solved may differ.)
+- A snapshot that does not fit is refused with one line that names the first difference, and nothing changes.
+  A file is refused if it is damaged, or if it was written by other code of tlf_env or with another version of
+  Numba or pymunk, as its future would be another. Nothing in a file is pickled, and loading it runs no code.
+- The simulation goes on as if it had not been asked. Snapshots can be pickled, and `==` compares all their
+  bits. With three robots `get_state` takes 0.15 ms and `set_state` 0.7 ms, and a file has 90 KB; with 256
+  formations in a batch it is 2 ms, 4 ms and 20 MB.
+
 ## Objects in the space
 
 Walls, obstacles, bodies to push and moving obstacles are fields of a scenario: [world.md](world.md). What it

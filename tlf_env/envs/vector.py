@@ -17,6 +17,7 @@ from tlf_env.common.errors import shown
 from tlf_env.engine import judging
 from tlf_env.engine.batch import BatchPlant, checked_count
 from tlf_env.engine.excerpt import END_ROW, REWARD_ROW, Excerpt
+from tlf_env.engine.snapshot import Snapshot, checked_generator, checked_snapshot
 from tlf_env.envs.single import BY_REFERENCE, HasSpec
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE
@@ -26,6 +27,7 @@ from tlf_env.task.scenario import Scenario, learners_action, load_scenario
 from tlf_env.task.start import start_options
 from tlf_env.task.warn import callers_level
 
+KIND = "FormationVectorEnv"
 RESET_MASK = "reset_mask"
 
 
@@ -215,12 +217,72 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         if given.any():
             self._np_random, self._np_random_seed = seeding.np_random(int(seeds[given][0]))
         self._over &= ~chosen
+        seen = self._now()
+        return seen.observations, self._infos(seen, None if mask is None else chosen)
+
+    def _now(self) -> Excerpt:
+        """What is seen of the learners at this moment."""
         seen = self.plant.excerpt(self._robot)
         self.plant.write_excerpt(seen)
         if self.autoreset_mode is AutoresetMode.NEXT_STEP and self._over.any():
             # They have ended and restart in the next step: until then their last observation is seen.
             seen.observations[self._over] = self._last[self._over]
-        return seen.observations, self._infos(seen, None if mask is None else chosen)
+        return seen
+
+    def get_state(self) -> Snapshot:
+        """Everything that the future of all formations depends on; :meth:`set_state` goes back to it.
+
+        At any time, also between the end of an episode and the next. Not in it: the generators of the spaces.
+
+        Raises
+        ------
+        RuntimeError
+            before the first :meth:`reset`.
+        """
+        shows_last = self.autoreset_mode is AutoresetMode.NEXT_STEP and self._over.any()
+        memory = {
+            "over": self._over,
+            "last": self._last if shows_last else None,
+            "own_random": self._np_random,
+            "own_random_seed": self._np_random_seed,
+        }
+        return self.plant.get_state().within(KIND, self._facts(), memory, {}, {})
+
+    def _facts(self) -> dict[str, Any]:
+        """What must be equal where a snapshot is put back, apart from the plant."""
+        return {"learner": self.learner, "autoreset_mode": self.autoreset_mode.value}
+
+    def set_state(self, state: Snapshot) -> tuple[np.ndarray, dict[str, Any]]:
+        """Go back to a moment of this environment, or of another one that was made with the same arguments.
+
+        Returns
+        -------
+        The observations and infos of that moment, of all formations, as :meth:`reset`.
+
+        Raises
+        ------
+        TypeError
+            for anything but a :class:`~tlf_env.engine.snapshot.Snapshot`.
+        ValueError
+            in one line that names the first difference, for a state that does not fit, or that is damaged;
+            then nothing has changed.
+        """
+        checked_snapshot(state).check(KIND, self._facts())
+        over, last = state.recall("over"), state.recall("last")
+        generator = checked_generator(state.recall("own_random"))
+        seed = state.recall("own_random_seed")
+        fits = getattr(over, "shape", None) == self._over.shape and over.dtype == np.bool_
+        if fits and over.any() and self.autoreset_mode is AutoresetMode.NEXT_STEP:
+            wanted = self.plant.excerpt(self._robot).observations
+            fits = getattr(last, "shape", None) == wanted.shape and last.dtype == wanted.dtype
+        if not fits:
+            raise ValueError("the snapshot is damaged: its ended formations do not fit")
+        self.plant.restore(state)
+        self._over = over
+        self._last = self._last if last is None else last
+        self._np_random, self._np_random_seed = generator, seed
+        seen = self._now()
+        return seen.observations, self._infos(seen)
 
     def step(
         self, actions: np.ndarray

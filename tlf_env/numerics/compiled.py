@@ -55,6 +55,7 @@ from numba.core.untyped_passes import (
 )
 from numba.extending import intrinsic
 
+from tlf_env.common.digest import code_digest
 from tlf_env.common.errors import shown
 
 try:
@@ -89,6 +90,15 @@ def sources_digest() -> str:
             digest.update(f"{room}/{path.name}\0".encode())
             digest.update(path.read_bytes())
     return digest.hexdigest()[:20]
+
+
+@functools.cache
+def simulation_digest() -> str:
+    """Digest of all code that can hold a law, without comments and docstrings, and of Numba's version.
+
+    Interrupted work is resumed only with the same simulation digest.
+    """
+    return code_digest((PACKAGE / room for room in ROOMS_WITH_LAWS), numba.__version__)
 
 
 @functools.cache

@@ -8,7 +8,8 @@ limit of its force.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 import pymunk
@@ -385,12 +386,30 @@ class ChipmunkPlant(PymunkPlant):
         self._impulses = np.zeros_like(self._limits)
 
     def reset(
-        self, constants: np.ndarray | None = None, mover_offsets_s: Sequence[float] | None = None
+        self,
+        constants: np.ndarray | None = None,
+        mover_offsets_s: Sequence[float] | None = None,
+        shapes_by: Sequence[int] | None = None,
     ) -> None:
         """As of the plant ``pymunk``."""
-        super().reset(constants, mover_offsets_s)
+        super().reset(constants, mover_offsets_s, shapes_by)
         self._torques = np.zeros((2, len(self.bodies)))  # of the last substep
         self._dt = 0.0
+
+    def state_layout(self) -> dict[str, tuple[Any, tuple[int | None, ...]]]:
+        """As of the plant ``pymunk``, and the torques (mN·mm) and the length (s) of the last substep."""
+        torques = (np.float64, (2, len(self.bodies)))
+        return {**super().state_layout(), "torques": torques, "dt": (np.float64, (1,))}
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """As of the plant ``pymunk``, between two control steps; constraints remember nothing then."""
+        last = {"torques": self._torques.copy(), "dt": np.array([self._dt])}
+        return {**super().get_state(), **last}
+
+    def set_state(self, state: Mapping[str, np.ndarray], constants: np.ndarray) -> None:
+        """As of the plant ``pymunk``."""
+        super().set_state(state, constants)
+        self._torques, self._dt = state["torques"].copy(), float(state["dt"][0])
 
     def _weigh(self, body: pymunk.Body, robot: Body) -> None:
         i = self.bodies.index(body)

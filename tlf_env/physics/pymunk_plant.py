@@ -9,7 +9,7 @@ a constraint or a force has moved are read back.
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from typing import Any, NamedTuple
 
@@ -29,6 +29,23 @@ from tlf_env.physics.objects import (
 from tlf_env.physics.parameters import Body, RobotParameters, body_array
 from tlf_env.physics.reach import CLOSE_MARGIN_MM, FASTEST_CHANGE_MM_S2, time_for, way
 from tlf_env.physics.shapes import PlacedShape, Pose, placed_link, placed_shape
+from tlf_env.physics.space_state import (
+    BODY_COLUMNS,
+    CONTACT_COLUMNS,
+    COUNTS,
+    PAIR_COLUMNS,
+    Correction,
+    add_shapes,
+    body_row,
+    check_contacts,
+    contacts_of,
+    hold,
+    put_body,
+    put_contacts,
+    shape_numbers,
+    structure_of,
+    take_correction,
+)
 from tlf_env.physics.state import Motion
 from tlf_env.physics.world import Capsule, World
 
@@ -59,6 +76,7 @@ LARGEST_MOVE = 0.25  # of that, within a step of the space
 LEAST_HALF_MM = 0.5  # a body that is thinner counts as so thick
 MOST_SPLITS = 1000  # of a substep
 SPRINGS = (pymunk.DampedSpring, pymunk.DampedRotarySpring)
+REST_COLUMNS = 6  # of a row with a Rest
 AT_REST_MM_S = 1e-6  # a body that is slower, and rubs on the floor, is at rest
 
 
@@ -69,14 +87,6 @@ class Rest(NamedTuple):
     angle: float
     velocity: tuple[float, float]
     angular_velocity: float
-
-
-class Correction(NamedTuple):
-    """A velocity that Chipmunk adds to a body's own in the next step only."""
-
-    x: float  # mm/s
-    y: float
-    turning: float  # rad/s
 
 
 class PymunkPlant:
@@ -144,12 +154,16 @@ class PymunkPlant:
         self.reset()
 
     def reset(
-        self, constants: np.ndarray | None = None, mover_offsets_s: Sequence[float] | None = None
+        self,
+        constants: np.ndarray | None = None,
+        mover_offsets_s: Sequence[float] | None = None,
+        shapes_by: Sequence[int] | None = None,
     ) -> None:
         """Forget all contacts and put all objects back, so that a run repeats bit for bit.
 
         ``constants`` (field, robot) are the bodies' constants of the kernel; None keeps the last ones.
-        ``mover_offsets_s`` is added to the times of the moving obstacles.
+        ``mover_offsets_s`` is added to the times of the moving obstacles. ``shapes_by`` are the numbers by
+        which the space shall know its shapes, as of :func:`~tlf_env.physics.space_state.shape_numbers`.
         """
         if constants is not None:
             self._constants = constants.copy()
@@ -157,7 +171,7 @@ class PymunkPlant:
         shapes = [*self._outlines, *(one for one in space.shapes if one not in self._outlines)]
         space.remove(*shapes)  # with a shape its contacts go
         for body in space.bodies:
-            _take_correction(body)
+            take_correction(body)
             body.force, body.torque = (0.0, 0.0), 0.0
         for body, rest in self._rests.items():
             body.angle, body.position = rest.angle, rest.position
@@ -172,7 +186,7 @@ class PymunkPlant:
                 outline.unsafe_set_offset((0.0, robot.outline_ahead))
             elif isinstance(outline, pymunk.Poly):
                 outline.unsafe_set_vertices(_from_com(polygon, robot))
-        space.add(*shapes)
+        add_shapes(space, shapes, range(len(shapes) + 1) if shapes_by is None else shapes_by)
         if mover_offsets_s is not None:
             for mover, offset_s in zip(self._movers, mover_offsets_s, strict=True):
                 mover.offset_s = offset_s
@@ -394,10 +408,10 @@ class PymunkPlant:
 
     def advance_objects(self, motions: np.ndarray, step: int, substeps: int, dt: float) -> None:
         """Run so many substeps of the space while the robots stand where they are."""
-        self._write(motions, np.zeros_like(motions))
         self._place_movers(step)
         self._hold_forces()
         self._forget_constraints()
+        self._index_anew(motions, np.zeros_like(motions))
         for _ in range(substeps):
             self._step_space(dt)
 
@@ -438,20 +452,36 @@ class PymunkPlant:
             body.angular_velocity = velocities[YAW, i, 0]
 
     def sort(self, motions: np.ndarray, step: int = 0) -> None:
-        """Make the space's index of outlines anew, robot by robot; to be called before a control step.
+        """Make the space's index of all that moves anew; to be called before a control step.
 
         The order in which Chipmunk solves contacts comes from that index, which otherwise depends on all
         that happened before, even on whether :meth:`space` was read. A body that changes its
-        type leaves the index and enters it again, and keeps its contacts. Two robots have only one.
+        type leaves the index and enters it again, and keeps its contacts. Two circles have only one.
         """
         self._place_movers(step)
         self._hold_forces()
         self._forget_constraints()
-        if len(self.bodies) <= 2 and len(self._space.shapes) == len(self.bodies):
+        self._index_anew(motions, motions)
+
+    def _index_anew(self, poses: np.ndarray, velocities: np.ndarray) -> None:
+        """Let all bodies that move leave the index and enter it again, robots last; see :meth:`sort`."""
+        robots_only = len(self._space.shapes) == len(self.bodies)
+        if robots_only and len(self.bodies) <= 2 and not any(self._polygons):
+            self._write(poses, velocities)
             return
+        loose = [
+            body
+            for body in self._space.bodies
+            if body not in self._number and body.body_type != pymunk.Body.STATIC and body.shapes
+        ]
+        held = [hold(body) for body in loose]
         for body in self.bodies:
             body.body_type = pymunk.Body.STATIC
-        self._write(motions, motions)
+        for one in held:
+            one.leave()
+        for one in held:
+            one.enter()
+        self._write(poses, velocities)
         for body, row in zip(self.bodies, self._constants.T.tolist(), strict=True):
             robot = Body(*row)
             for outline in body.shapes:
@@ -549,14 +579,107 @@ class PymunkPlant:
             body._position_func = None  # pymunk before 7.3.1 keeps the last one, and copies it
         self._corrections = []
 
+    def _is_calm(self) -> bool:
+        """Whether nothing has been stirred since objects were found to be out of reach."""
+        return self._calm_until > 0 and self._stir() == self._calm
+
+    def _take_corrections(self) -> None:
+        """Take the corrections of the next step from the bodies; that step adds them itself."""
+        if not self._corrections:
+            self._corrections = [(body, take_correction(body)) for body in self._space.bodies]
+
+    def structure(self) -> dict[str, Any]:
+        """What is in the space, a user's things too, apart from its motion, as JSON values."""
+        return structure_of(self._space, frozenset([*self.bodies, *self._outlines]))
+
+    def state_layout(self) -> dict[str, tuple[Any, tuple[int | None, ...]]]:
+        """Dtype and shape of the arrays of :meth:`get_state`, None where any length fits."""
+        bodies, robots = len(self._space.bodies), len(self.bodies)
+        return {
+            "bodies": (np.float64, (bodies, BODY_COLUMNS)),
+            "corrections": (np.float64, (bodies, len(Correction._fields))),
+            "rests": (np.float64, (bodies, REST_COLUMNS)),
+            "has_rest": (np.bool_, (bodies,)),
+            "shape_numbers": (np.int64, (len(self._space.shapes) + 1,)),
+            "pair_counts": (np.int64, (None, len(COUNTS))),
+            "pairs": (np.float64, (None, PAIR_COLUMNS)),
+            "contacts": (np.float64, (None, CONTACT_COLUMNS)),
+            "contact_keys": (np.uint64, (None,)),
+            "last_dt": (np.float64, (1,)),
+            "offsets_s": (np.float64, (len(self._movers),)),
+            "moved": (np.bool_, (2, robots)),
+            "calm": (np.int64, (2,)),
+        }
+
+    def get_state(self) -> dict[str, np.ndarray]:
+        """Everything that the next steps depend on, apart from the robots' motions and constants.
+
+        The space goes on with the same bits as if it had not been asked.
+        """
+        bodies, robots = list(self._space.bodies), range(len(self.bodies))
+        self._take_corrections()
+        none = Correction(0.0, 0.0, 0.0)
+        corrections = dict(self._corrections)
+        rests = [self._rests.get(body) for body in bodies]
+        return {
+            "bodies": np.array([body_row(body) for body in bodies]),
+            "corrections": np.array([corrections.get(body, none) for body in bodies]),
+            "rests": np.array([_rest_row(rest) for rest in rests]),
+            "has_rest": np.array([rest is not None for rest in rests]),
+            "shape_numbers": shape_numbers(self._space),
+            **contacts_of(self._space),
+            "offsets_s": np.array([mover.offset_s for mover in self._movers], dtype=np.float64),
+            "moved": np.array(
+                [[i in some for i in robots] for some in (self._moved, self._moved_before)]
+            ),
+            "calm": np.array([self._calm_until, self._is_calm()], dtype=np.int64),
+        }
+
+    def check_state(self, state: Mapping[str, np.ndarray]) -> None:
+        """Refuse a state that no such space can have; its arrays are as in :meth:`state_layout`.
+
+        Raises
+        ------
+        ValueError
+            saying what is wrong.
+        """
+        check_contacts(state, len(self._space.shapes))
+        numbers = state["shape_numbers"]
+        if (numbers < 0).any() or len(np.unique(numbers)) < len(numbers):
+            raise ValueError("shapes that have no number of their own")
+
+    def set_state(self, state: Mapping[str, np.ndarray], constants: np.ndarray) -> None:
+        """Go on from a state of :meth:`get_state`, with the bodies' ``constants`` as of :meth:`reset`."""
+        self.reset(constants, state["offsets_s"].tolist(), state["shape_numbers"].tolist())
+        bodies = list(self._space.bodies)
+        for body, row in zip(bodies, state["bodies"].tolist(), strict=True):
+            put_body(body, row)
+            self._space.reindex_shapes_for_body(body)
+        put_contacts(self._space, state)
+        self._corrections = [
+            (body, Correction(*row))
+            for body, row in zip(bodies, state["corrections"].tolist(), strict=True)
+        ]
+        self._rests = {
+            body: Rest((row[0], row[1]), row[2], (row[3], row[4]), row[5])
+            for body, row, there in zip(
+                bodies, state["rests"].tolist(), state["has_rest"], strict=True
+            )
+            if there
+        }
+        self._moved, self._moved_before = (
+            set(np.flatnonzero(row).tolist()) for row in state["moved"]
+        )
+        self._calm_until, calm = state["calm"].tolist()
+        self._calm = self._stir() if calm else ()
+
     def __getstate__(self) -> dict[str, Any]:
         """Everything, with the contacts' memory: what pymunk keeps of it, and what it leaves out."""
-        if not self._corrections:
-            self._corrections = [(body, _take_correction(body)) for body in self._space.bodies]
+        self._take_corrections()
         return {
             **self.__dict__,
             "_buffer": None,
-            "_calm": (),
+            "_calm": self._is_calm(),
             "_sizes": {},
             "_borders": None,
             "_bordered": ([], []),
@@ -564,6 +687,7 @@ class PymunkPlant:
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         self.__dict__.update(state, _buffer=Buffer())
+        self._calm = self._stir() if state["_calm"] else ()
 
 
 def half_thickness(body: pymunk.Body) -> float:
@@ -600,6 +724,12 @@ def _rest(body: pymunk.Body) -> Rest:
     return Rest(body.position, body.angle, body.velocity, body.angular_velocity)
 
 
+def _rest_row(rest: Rest | None) -> tuple[float, ...]:
+    if rest is None:
+        return REST_COLUMNS * (0.0,)
+    return (*rest.position, rest.angle, *rest.velocity, rest.angular_velocity)
+
+
 def _from_com(
     polygon: Sequence[tuple[float, float]] | None, robot: Body
 ) -> list[tuple[float, float]]:
@@ -614,15 +744,17 @@ def _is_still(body: pymunk.Body) -> bool:
 def _is_forced(body: pymunk.Body, passive: Collection[pymunk.Constraint] = ()) -> bool:
     """Whether a force, a constraint or a function of the user's may change a body's motion.
 
-    ``passive`` constraints move nothing that is at rest.
+    ``passive`` constraints move nothing that is at rest. A body also knows constraints that have left the
+    space, until Python collects them: they do not count.
     """
+    acting = () if body.space is None else body.space.constraints
     velocity_func = body.velocity_func
     if isinstance(velocity_func, partial) and velocity_func.func is damped_velocity:
         velocity_func = pymunk.Body.update_velocity
     return bool(
         body.force != (0.0, 0.0)
         or body.torque
-        or any(one not in passive for one in body.constraints)
+        or any(one in acting and one not in passive for one in body.constraints)
         or velocity_func is not pymunk.Body.update_velocity
         or body.position_func is not pymunk.Body.update_position
     )
@@ -637,34 +769,6 @@ def _fastest_point(body: pymunk.Body) -> float:
         far_y = max(abs(box.bottom - body.position.y), abs(box.top - body.position.y))
         radius = max(radius, math.hypot(far_x, far_y))
     return body.velocity.length + abs(body.angular_velocity) * radius
-
-
-def _take_correction(body: pymunk.Body) -> Correction:
-    """The velocity with which Chipmunk's next step will push a body out of an overlap, taken from it.
-
-    pymunk has no property for it. But a body at rest at the origin goes just that far in one second.
-    """
-    centre = body.center_of_gravity
-    _move_origin(body, (0.0, 0.0))
-    pose, twist = (body.position, body.angle), (body.velocity, body.angular_velocity)
-    body.position, body.angle, body.velocity, body.angular_velocity = (
-        (0.0, 0.0),
-        0.0,
-        (0.0, 0.0),
-        0.0,
-    )
-    pymunk.Body.update_position(body, 1.0)
-    correction = Correction(*body.position, body.angle)
-    body.position, body.angle = pose
-    body.velocity, body.angular_velocity = twist
-    _move_origin(body, centre)
-    return correction
-
-
-def _move_origin(body: pymunk.Body, centre: tuple[float, float]) -> None:
-    """Move a body's origin so that its centre of mass, which stays where it is, is at ``centre``."""
-    body.center_of_gravity = centre
-    body.angle = body.angle  # only now does the position follow
 
 
 def _advance_corrected(correction: Correction, body: pymunk.Body, dt: float) -> None:

@@ -171,7 +171,7 @@ class MovingHorizonEstimator(Reckoning):
         super().reset(pose)
         self._pasts: list[Interval] = []  # between the nodes
         self._ways_at = [self._way]  # the way at the nodes
-        self._states = self.state[None]
+        self._states = self.state[None].copy()
         # Fixes of each node, moved on along the way to it; 1 where there is one: at most one of each period.
         nodes = self._links + 1
         self._measured = np.zeros((nodes, self._every, 2))
@@ -196,7 +196,7 @@ class MovingHorizonEstimator(Reckoning):
         self._new = []
         change, self.covariance = self._step(*self._terms(len(self._states)))
         self._states = self._states + change
-        self.state = self._states[-1]
+        self.state = self._states[-1].copy()
 
     def _place(self, fix: Fix, t_s: float) -> None:
         """Put a fix at the first node at or after its time; one from before the window is left out."""

@@ -103,7 +103,6 @@ class UnscentedEstimator(Reckoning):
         """Start at the true pose ``(x mm, y mm, θ rad)``, at rest."""
         self._fixes, self._sum_x, self._sum_y = 0, 0.0, 0.0
         super().reset(pose)
-        self._filter = UnscentedKalmanFilter(self.state, self.covariance)
 
     def _take(self, fix: Fix) -> None:
         if fix.nis <= self.GATE:
@@ -118,8 +117,9 @@ class UnscentedEstimator(Reckoning):
             rolling = rolling_speed(points, past)
             return np.column_stack([rolling, points[:, :2]])[:, : 3 if self._fixes else 1]
 
+        ukf = UnscentedKalmanFilter(self.state, self.covariance)
         middle = float(self.state[THETA]) + 0.5 * past.turned
-        self._filter.predict(
+        ukf.predict(
             lambda points: moved(points, past, self.noise), in_world(self._variances, middle)
         )
         measured = [past.rolled / past.time_s]
@@ -130,6 +130,6 @@ class UnscentedEstimator(Reckoning):
                 self._sum_y / self._fixes + self._way[1],
             ]
             variances += 2 * [self.fix_variance / self._fixes]
-        self._filter.correct(measure, np.array(measured), np.diag(variances))
-        self.state, self.covariance = self._filter.mean, self._filter.covariance
+        ukf.correct(measure, np.array(measured), np.diag(variances))
+        self.state, self.covariance = ukf.mean, ukf.covariance
         self._fixes, self._sum_x, self._sum_y = 0, 0.0, 0.0
