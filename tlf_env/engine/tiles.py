@@ -76,6 +76,7 @@ from tlf_env.engine.substeps import (
     with_grip,
 )
 from tlf_env.numerics.compiled import allocating, block, law, view
+from tlf_env.numerics.memory import table
 from tlf_env.numerics.rows import replacing
 from tlf_env.onboard.kinds import EKF_GYRO
 from tlf_env.onboard.speed_observer import observed_speeds
@@ -594,7 +595,7 @@ def advance(
     settings: Settings,
 ) -> None:
     """:func:`advance_in` a tile of its own."""
-    advance_in(np.empty((TILE_ROWS, WIDTH)), arrays, lanes, begin, end, actuates, senses, settings)
+    advance_in(table(TILE_ROWS, WIDTH), arrays, lanes, begin, end, actuates, senses, settings)
 
 
 @block
