@@ -8,7 +8,7 @@ import pytest
 from tlf_env.engine.arrays import make_arrays
 from tlf_env.engine.formation import reference_table
 from tlf_env.numerics.compiled import driver
-from tlf_env.numerics.memory import CACHE_LINE_BYTES, table, zeros
+from tlf_env.numerics.memory import CACHE_LINE_BYTES, shaped, table, zeros
 from tlf_env.task.scenario import load_scenario
 
 
@@ -18,9 +18,10 @@ def place_of_a_table(numbers: np.ndarray) -> int:
     for i in range(5):
         for j in range(8):
             t[i, j] = numbers[i, j]
+    same = shaped(t, 5, 8)
     for i in range(5):
         for j in range(8):
-            numbers[i, j] = 2.0 * t[i, j]
+            numbers[i, j] = 2.0 * same[i, j]
     return t.ctypes.data
 
 

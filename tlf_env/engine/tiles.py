@@ -76,11 +76,24 @@ from tlf_env.engine.substeps import (
     with_grip,
 )
 from tlf_env.numerics.compiled import allocating, block, law, view
-from tlf_env.numerics.memory import table
-from tlf_env.numerics.rows import replacing
+from tlf_env.numerics.memory import shaped, table
+from tlf_env.numerics.rows import choosing, replacing
 from tlf_env.onboard.kinds import EKF_GYRO
 from tlf_env.onboard.speed_observer import observed_speeds
-from tlf_env.physics.vehicle import Push, advance_pose, follow_wheels, roll, slide
+from tlf_env.physics.vehicle import (
+    SLIDE_COLUMNS,
+    SLIDE_ROWS,
+    Contact,
+    Motion,
+    Push,
+    advance_pose,
+    begin_slide,
+    end_slide,
+    follow_wheels,
+    roll,
+    slide,
+    sweep_together,
+)
 from tlf_env.task.actions import EXTERNAL_TORQUE, TORQUE
 
 WIDTH = 8  # robots in a tile: doubles in the widest vectors there are
@@ -96,6 +109,8 @@ LIMITING = np.array(
 )
 NOT_PULLING = np.zeros(len(PULLING))
 NOT_LIMITING = np.array([0.0, 0.0, 1.0, 1.0])
+
+MOST_ALONE = 2  # sliding robots of a tile that are faster one by one than side by side
 
 SPEED_OBSERVERS = np.array([in_tile("speed_observer", "angle")])
 NO_SPEED_OBSERVER = np.zeros(1)
@@ -128,6 +143,7 @@ reading_of, set_reading = tile_access("reading")
 moved_of, set_moved = tile_access("moved")
 impulses_of, set_impulses = tile_access("impulses")
 draw_of, set_draw = tile_access("draw")  # of the tile as whole numbers
+chosen_motion, chosen_contact = choosing(Motion), choosing(Contact)
 with_speeds = replacing(Sensors, "speed_l", "speed_r")
 TICK = in_tile("draw", "tick")
 ROLLS = in_tile("rolls", "all")
@@ -360,6 +376,54 @@ def hand_over(inputs: np.ndarray, lanes: int, tile: np.ndarray, count: int) -> N
         write_push(inputs, robot, lane, push_of(tile, i))
 
 
+@block
+def slide_alone(tile: np.ndarray, count: int, dt: float) -> None:
+    """By sweeps, robot by robot, those whose wheels do not all roll."""
+    tile = shaped(tile, TILE_ROWS, WIDTH)
+    for i in range(count):
+        if tile[ROLLS, i] == 0.0:
+            body, traction = body_of(tile, i), traction_of(tile, i)
+            motion, impulses = slide(
+                body,
+                motion_of(tile, i),
+                contact_of(tile, i),
+                floor_under(body, effects_of(tile, i), traction),
+                push_of(tile, i),
+                traction.delivered_l,
+                traction.delivered_r,
+                dt,
+            )
+            set_moved(tile, i, motion)
+            set_impulses(tile, i, impulses)
+
+
+@block
+def slide_together(tile: np.ndarray, dt: float) -> None:
+    """By sweeps, side by side, those whose wheels do not all roll."""
+    tile, sweeps = shaped(tile, TILE_ROWS, WIDTH), table(SLIDE_ROWS, SLIDE_COLUMNS)
+    for i in range(WIDTH):
+        body, traction = body_of(tile, i), traction_of(tile, i)
+        begin_slide(
+            sweeps,
+            i,
+            tile[ROLLS, i] == 0.0,
+            body,
+            motion_of(tile, i),
+            contact_of(tile, i),
+            floor_under(body, effects_of(tile, i), traction),
+            push_of(tile, i),
+            traction.delivered_l,
+            traction.delivered_r,
+            dt,
+        )
+    sweep_together(sweeps)
+    for i in range(WIDTH):
+        slides = tile[ROLLS, i] == 0.0
+        motion, impulses = end_slide(sweeps, i, motion_of(tile, i), dt)
+        set_moved(tile, i, chosen_motion(slides, motion, moved_of(tile, i)))
+        set_impulses(tile, i, chosen_contact(slides, impulses, impulses_of(tile, i)))
+
+
 @law
 def move(tile: np.ndarray, count: int, dt: float) -> None:
     """The plant: all in closed form, then by sweeps those whose wheels do not all roll."""
@@ -378,21 +442,14 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
         set_moved(tile, i, motion)
         set_impulses(tile, i, impulses)
         tile[ROLLS, i] = 1.0 if rolls else 0.0
+    sliding = 0
     for i in range(count):
         if tile[ROLLS, i] == 0.0:
-            body, traction = body_of(tile, i), traction_of(tile, i)
-            motion, impulses = slide(
-                body,
-                motion_of(tile, i),
-                contact_of(tile, i),
-                floor_under(body, effects_of(tile, i), traction),
-                push_of(tile, i),
-                traction.delivered_l,
-                traction.delivered_r,
-                dt,
-            )
-            set_moved(tile, i, motion)
-            set_impulses(tile, i, impulses)
+            sliding += 1
+    if sliding > MOST_ALONE:
+        slide_together(tile, dt)
+    elif sliding > 0:
+        slide_alone(tile, count, dt)
     for i in range(WIDTH):
         motion, impulses = moved_of(tile, i), impulses_of(tile, i)
         limit = body_of(tile, i).torque_limit

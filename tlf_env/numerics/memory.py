@@ -55,3 +55,18 @@ def table(_context: Any, rows: Any, columns: Any) -> Any:
         return _array_at(context, builder, array, memory, shape)
 
     return array(rows, columns), build
+
+
+@intrinsic(prefer_literal=True)
+def shaped(_context: Any, array: Any, rows: Any, columns: Any) -> Any:
+    """The same table of floats ``(rows, columns)``, of a size that is known when compiling; not checked.
+
+    For a function that is called rather than inlined: without it, its loops would not become vectors.
+    """
+    shape = rows.literal_value, columns.literal_value
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        data = context.make_array(array)(context, builder, value=values[0]).data
+        return _array_at(context, builder, signature.return_type, data, shape)
+
+    return array(array, rows, columns), build
