@@ -761,6 +761,8 @@ def advance_in(
     samples = arrays.samples.reshape((*arrays.samples.shape[:2], robots * lanes_in_all))
     torques, patches, variants = arrays.torques, arrays.patches, arrays.variants
     fixes = arrays.fixes.reshape((*arrays.fixes.shape[:2], robots * lanes_in_all))
+    # All samples of a control step are kept for those who read them, otherwise only the last.
+    keeps = settings.has_parts or arrays.sensor_observations.shape[2] > 0
     columns = columns_of(tile)
     items = lanes.shape[0] * robots
     for item in range(0, items, WIDTH):
@@ -812,9 +814,10 @@ def advance_in(
                     observe_wheels(tile, settings.dt)
                 if needs.fixes and due.measured:
                     keep_ways(fixes, tile, count)
-                for f in range(SAMPLE_FIELDS):
-                    for i in range(count):
-                        samples[substep, f, columns[i]] = tile[SAMPLE + f, i]
+                if keeps or substep == end - 1:
+                    for f in range(SAMPLE_FIELDS):
+                        for i in range(count):
+                            samples[substep, f, columns[i]] = tile[SAMPLE + f, i]
         store(tile, STATES_IN_TILE, states, STATE_FIELDS, columns, count)
     if senses:
         for i in range(lanes.shape[0]):
