@@ -8,7 +8,7 @@ import pytest
 from tlf_env.engine.arrays import make_arrays
 from tlf_env.engine.formation import reference_table
 from tlf_env.numerics.compiled import driver
-from tlf_env.numerics.memory import CACHE_LINE_BYTES, shaped, table, zeros
+from tlf_env.numerics.memory import CACHE_LINE_BYTES, prefetch, shaped, table, zeros
 from tlf_env.task.scenario import load_scenario
 
 
@@ -25,10 +25,26 @@ def place_of_a_table(numbers: np.ndarray) -> int:
     return t.ctypes.data
 
 
+@driver
+def ask_for_all(numbers: np.ndarray) -> float:
+    total = 0.0
+    for i in range(numbers.shape[0]):
+        for j in range(numbers.shape[1]):
+            prefetch(numbers, i, j)
+            total += numbers[i, j]
+    return total
+
+
 def test_a_table_holds_numbers_and_begins_at_a_cache_line():
     numbers = np.arange(40.0).reshape(5, 8)
     assert place_of_a_table(numbers) % CACHE_LINE_BYTES == 0
     assert (numbers == 2.0 * np.arange(40.0).reshape(5, 8)).all()
+
+
+def test_asking_ahead_changes_nothing():
+    numbers = np.arange(40.0).reshape(5, 8)
+    assert ask_for_all(numbers) == 780.0
+    assert (numbers == np.arange(40.0).reshape(5, 8)).all()
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 3, 5), (0, 4)])

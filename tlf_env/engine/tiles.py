@@ -83,7 +83,7 @@ from tlf_env.engine.substeps import (
     with_grip,
 )
 from tlf_env.numerics.compiled import allocating, block, law, view
-from tlf_env.numerics.memory import shaped, table
+from tlf_env.numerics.memory import prefetch, shaped, table
 from tlf_env.numerics.rows import choosing, replacing
 from tlf_env.onboard.kinds import EKF, EKF_GYRO, EKF_SLIP
 from tlf_env.onboard.speed_observer import observed_speeds
@@ -199,6 +199,36 @@ def store(
     for f in range(fields):
         for i in range(count):
             array[f, columns[i]] = tile[first + f, i]
+
+
+@law
+def columns_after(lanes: np.ndarray, lanes_in_all: int, item: int, items: int) -> tuple[int, int]:
+    """First and last column of the tile that begins with an item; after the last, of the lanes that follow.
+
+    Where the next call takes other lanes, nothing is lost but a little time.
+    """
+    number = lanes.shape[0]
+    if item < items:
+        last = min(item + WIDTH, items) - 1
+        return (
+            item // number * lanes_in_all + lanes[item % number],
+            last // number * lanes_in_all + lanes[last % number],
+        )
+    following = lanes[number - 1] + 1
+    return min(following, lanes_in_all - 1), min(following + WIDTH, lanes_in_all) - 1
+
+
+@law
+def ask_for(
+    constants: np.ndarray, states: np.ndarray, columns: tuple[int, int], row: int, rows: int
+) -> None:
+    """Have so many rows from ``row`` on, of constants and then states, brought to the cache for later."""
+    for k in range(row, min(row + rows, constants.shape[0] + STATE_FIELDS)):
+        for column in columns:
+            if k < constants.shape[0]:
+                prefetch(constants, k, column)
+            else:
+                prefetch(states, k - constants.shape[0], column)
 
 
 @law
@@ -764,7 +794,7 @@ def advance_in(
     # All samples of a control step are kept for those who read them, otherwise only the last.
     keeps = settings.has_parts or arrays.sensor_observations.shape[2] > 0
     columns = columns_of(tile)
-    items = lanes.shape[0] * robots
+    items, ahead = lanes.shape[0] * robots, constants.shape[0] + STATE_FIELDS
     for item in range(0, items, WIDTH):
         count = min(WIDTH, items - item)
         assign(arrays, tile, lanes, item, count, settings)
@@ -776,7 +806,11 @@ def advance_in(
             for f in range(LAST_FIX.shape[0]):
                 for i in range(WIDTH):
                     tile[SAMPLE + LAST_FIX[f], i] = samples[begin - 1, LAST_FIX[f], columns[i]]
+        next_columns = columns_after(lanes, lanes_in_all, item + WIDTH, items)
         for substep in range(begin, end):
+            if end - begin > 1:
+                share = ahead // (end - begin) + 1
+                ask_for(constants, states, next_columns, (substep - begin) * share, share)
             if actuates:
                 if settings.changing:
                     change_effects(arrays, tile, count, settings)

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 from numba import types
+from numba.core import cgutils
 from numba.extending import intrinsic
 
 CACHE_LINE_BYTES = 64  # of all processors that are common
@@ -70,3 +71,24 @@ def shaped(_context: Any, array: Any, rows: Any, columns: Any) -> Any:
         return _array_at(context, builder, signature.return_type, data, shape)
 
     return array(array, rows, columns), build
+
+
+@intrinsic
+def prefetch(_context: Any, array: Any, _row: Any, _column: Any) -> Any:
+    """Have the cache line of an element of a two-dimensional array brought to the cache, to be read later."""
+    place = types.intp
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        kind = signature.args[0]
+        made = context.make_array(kind)(context, builder, value=values[0])
+        where = cgutils.get_item_pointer(context, builder, kind, made, values[1:])
+        bytes_at = builder.bitcast(where, ir.IntType(8).as_pointer())
+        number = ir.IntType(32)
+        kinds = [bytes_at.type, number, number, number]
+        ask = builder.module.declare_intrinsic(
+            "llvm.prefetch", [bytes_at.type], ir.FunctionType(ir.VoidType(), kinds)
+        )
+        builder.call(ask, [bytes_at, number(0), number(3), number(1)])
+        return context.get_dummy_value()
+
+    return types.none(array, place, place), build
