@@ -9,7 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tlf_env.disturbances.channels import CHANNELS, DEAD_TIME, EPISODE, FIX_DELAY, JITTER
-from tlf_env.disturbances.model import PatchRow, leveled, patch_rows, signal_rows
+from tlf_env.disturbances.model import (
+    PatchRow,
+    changing_channels,
+    leveled,
+    patch_rows,
+    signal_rows,
+)
 from tlf_env.engine.layout import (
     BY_NAME,
     CONSTANT_FIELDS,
@@ -119,6 +125,9 @@ class Arrays(NamedTuple):
     sensor_scales: np.ndarray  # (entry,) of `sensor`
     weights: np.ndarray  # (RewardTerms,)
     previews: np.ndarray  # (preview,) int64, in control steps
+    changing: (
+        np.ndarray
+    )  # (channel,) int64: places of those that may change in every substep, in some variant
 
     def rows(self, name: str) -> np.ndarray:
         """A row of the engine's table by name, ``(field, robot, lane)``; a view."""
@@ -323,4 +332,5 @@ def make_arrays(
         sensor_scales=np.array([entry.scale for entry in sensor.values()]),
         weights=np.array([scenario.reward[name] for name in RewardTerms._fields]),
         previews=np.array(scenario.preview_steps, dtype=np.int64),
+        changing=changing_channels([one.disturbance for one in scenarios], scenario.adversary),
     )

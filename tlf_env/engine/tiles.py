@@ -287,7 +287,8 @@ def change_effects(arrays: Arrays, tile: np.ndarray, count: int, settings: Setti
     changed = False
     for i in range(count):
         draw, column = draw_of(whole(tile), i), whole(tile)[COLUMN, i]
-        changed |= refresh(arrays, column % lanes, draw.robot, OF_SUBSTEPS, draw.tick, 1, settings)
+        lane, robot = column % lanes, draw.robot
+        changed |= refresh(arrays, lane, robot, arrays.changing, draw.tick, 1, settings)
     if changed:
         load_effects(tile, flat(arrays.applied), columns_of(tile))
 
