@@ -118,7 +118,8 @@ def tree(channels):
 
 
 def make(disturbance=None, *, seed=0, parts=None, **overrides):
-    overrides = {"time_gap_s": GAP_S, "horizon_s": 20.0, "end_on": ()} | overrides
+    given = {"time_gap_s": GAP_S, "horizon_s": 20.0, "end_on": ()}
+    overrides = given | {"observation": "sensor"} | overrides  # so that all samples are kept
     scenario = load_scenario("infinity", disturbance=disturbance or {}, **overrides)
     formation = Formation(scenario, parts)
     formation.reset(seed)

@@ -141,7 +141,9 @@ def test_a_turn_has_the_presets_counts(counts):
 
 def samples(preset, seconds):
     """Sensor samples (substep, robot) of robots at rest under a preset, by name."""
-    env = tlf_env.parallel_env("infinity", disturbance=preset, end_on=(), preview_s=())
+    env = tlf_env.parallel_env(
+        "infinity", disturbance=preset, end_on=(), preview_s=(), observation="sensor"
+    )
     env.reset(seed=0)
     rest = {agent: np.zeros(2, dtype=np.float32) for agent in env.agents}
     found = []

@@ -35,6 +35,7 @@ def columns(samples, *names):
 
 def sampled(seconds, action=(0.3, 0.0), *, seed=0, plant="pymunk", **overrides):
     """Samples (substep, Sample) and true states (step, State) of one robot with a constant action."""
+    overrides = {"observation": "sensor"} | overrides  # so that all samples are kept
     env = tlf_env.parallel_env(
         "infinity", robots=1, plant=plant, end_on=(), preview_s=(), **overrides
     )

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 import tlf_env
+from tlf_env import BatchPlant
 from tlf_env.disturbances.channels import SUBSTEP, Effects, numbers
 from tlf_env.engine import drivers
 from tlf_env.engine.arrays import Arrays, make_arrays, make_variants
@@ -16,15 +17,19 @@ from tlf_env.engine.layout import (
     Draw,
     Order,
     Sample,
+    Trace,
     WheelPair,
     YawRate,
     array_reader,
     array_writer,
 )
 from tlf_env.engine.sensors import (
+    account_robot,
+    correct_robot,
     disturbed_encoders,
     measured_fix,
-    sense_robot,
+    odometry_of,
+    predict_robot,
     sense_with_gyro,
 )
 from tlf_env.engine.settings import Settings, make_settings
@@ -36,6 +41,7 @@ from tlf_env.onboard.kinds import EKF_GYRO
 from tlf_env.physics.kernel import substep
 from tlf_env.physics.state import Push, advance_pose
 from tlf_env.task.actions import TWIST
+from tlf_env.task.scenario import load_scenario
 
 EVERYTHING: dict[str, Any] = {
     "slip": {"delta_1_mm_s": {"type": "ornstein_uhlenbeck", "std": 10, "time_constant_s": 2}},
@@ -155,7 +161,7 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                 read_slip_ekf(a.constants, r, lane),
             )
             wanted_l, wanted_r = read_command(a.states, r, lane)
-            order = Order(float(TWIST), wanted_l, wanted_r, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+            order = Order(float(TWIST), wanted_l, wanted_r, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
             for k in range(s.substeps):
                 tick = a.clock[lane, 0] + k
                 if s.changing:
@@ -202,23 +208,39 @@ def one_by_one(a: Arrays, s: Settings) -> None:
                     )
                     write_gyro(a.states, r, lane, found)
                 else:
-                    sensors, estimate, slip, trace, sample = sense_robot(
+                    belief = read_belief(a.constants, r, lane)
+                    reading = disturbed_encoders(motion, effects, draw)
+                    increments = odometry_of(body, belief, reading, sensors)
+                    sensors, estimate, slip = predict_robot(
                         body,
-                        read_belief(a.constants, r, lane),
+                        belief,
                         ekf,
                         slip_ekf,
                         motion,
-                        disturbed_encoders(motion, effects, draw),
-                        measured_fix(body, motion, effects, draw),
-                        YawRate(motion.w),
-                        WheelPair(commanded_l, commanded_r),
+                        increments,
                         sensors,
                         read_estimate(a.states, r, lane),
                         read_slip(a.states, r, lane),
-                        trace,
                         order,
                         k,
                         s.estimator,
+                        s.dt,
+                    )
+                    fix = measured_fix(body, motion, effects, draw)
+                    estimate, slip, innovation = correct_robot(
+                        ekf, slip_ekf, fix, sensors, estimate, slip, s.estimator
+                    )
+                    sensors, trace, sample = account_robot(
+                        reading,
+                        fix,
+                        YawRate(motion.w),
+                        WheelPair(commanded_l, commanded_r),
+                        increments,
+                        sensors,
+                        estimate,
+                        slip,
+                        trace,
+                        innovation,
                         s.dt,
                     )
                 write_motion(a.states, r, lane, motion)
@@ -251,4 +273,55 @@ def test_a_tile_gives_the_bits_of_the_laws_run_one_by_one(disturbance, estimator
     for _ in range(5):
         one_by_one(a, s)
         in_tiles(b, np.arange(lanes), s)
+    a.samples[:-1] = 0.0  # only the last are kept
     assert_same(a, b)
+
+
+@driver
+def substep_by_substep(a: Arrays, lanes: np.ndarray, s: Settings) -> None:
+    for k in range(s.substeps):
+        advance(a, lanes, k, k + 1, True, True, s)
+
+
+@pytest.mark.parametrize("estimator", ["ekf", "ekf-slip", "ekf-gyro", "truth"])
+@pytest.mark.parametrize(
+    "disturbance", ["fixes-100hz", "fixes-camera", "fixes-uwb", "fixes-outage"]
+)
+def test_fixes_come_alike_whether_substeps_are_taken_at_once_or_one_by_one(disturbance, estimator):
+    lanes = WIDTH + 3
+    (a, s), (b, _) = (
+        thrown_about(lanes, disturbance=disturbance, estimator=estimator) for _ in range(2)
+    )
+    for _ in range(20):
+        in_tiles(a, np.arange(lanes), s)
+        substep_by_substep(b, np.arange(lanes), s)
+    assert b.rows("trace")[Trace._fields.index("fixes")].all()
+    b.samples[:-1] = 0.0  # only the last are kept
+    assert_same(a, b)
+
+
+def test_what_fixes_the_others_in_a_tile_get_does_not_matter():
+    names = ["nominal", "fixes-camera", "fixes-100hz", "none", "fixes-uwb"]
+    scenarios = [load_scenario("infinity", disturbance=name, plant="batch") for name in names]
+    many = BatchPlant(scenarios, len(names))
+    many.reset(seed=3)
+    actions = np.random.default_rng(0).uniform(-1, 1, (25, *many.arrays.actions.shape))
+    for action in actions:
+        many.step(action)
+    for k, scenario in enumerate(scenarios):
+        alone = BatchPlant(scenario, 1)
+        alone.reset(seed=3 + k)
+        for action in actions:
+            alone.step(action[k : k + 1])
+        assert (alone.observations[0] == many.observations[k]).all()
+        for name in ("motion", "estimate", "slip", "trace"):
+            assert (alone.arrays.rows(name)[:, :, 0] == many.arrays.rows(name)[:, :, k]).all()
+
+
+@pytest.mark.parametrize(("observation", "kept"), [("tracking", False), ("sensor", True)])
+def test_the_samples_of_all_substeps_are_kept_for_those_who_read_them(observation, kept):
+    plant = BatchPlant("infinity", 2, observation=observation)
+    plant.reset(seed=0)
+    plant.step(np.full(plant.arrays.actions.shape, 0.5))
+    assert plant.arrays.samples[-1].any()
+    assert plant.arrays.samples[:-1].any() == kept

@@ -231,9 +231,21 @@ def patch_rows(disturbance: Disturbance, floor: Sequence[Patch] = ()) -> np.ndar
     return np.array(rows, dtype=np.float64).reshape(-1, len(PatchRow._fields))
 
 
+def changing_channels(disturbances: Sequence[Disturbance], all_of_them: bool) -> np.ndarray:
+    """Places of the channels of every substep that vary while an episode runs, in some disturbance; or all."""
+    return np.array(
+        [
+            i
+            for i in numbers(SUBSTEP)
+            if all_of_them or not all(one.signal(PATHS[i]).is_steady() for one in disturbances)
+        ],
+        dtype=np.int64,
+    )
+
+
 def changes_within_episode(disturbance: Disturbance) -> bool:
     """Whether a channel of every substep varies while an episode runs."""
-    return not all(disturbance.signal(PATHS[i]).is_steady() for i in numbers(SUBSTEP))
+    return len(changing_channels([disturbance], False)) > 0
 
 
 @law

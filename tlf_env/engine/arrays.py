@@ -9,7 +9,13 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tlf_env.disturbances.channels import CHANNELS, DEAD_TIME, EPISODE, FIX_DELAY, JITTER
-from tlf_env.disturbances.model import PatchRow, leveled, patch_rows, signal_rows
+from tlf_env.disturbances.model import (
+    PatchRow,
+    changing_channels,
+    leveled,
+    patch_rows,
+    signal_rows,
+)
 from tlf_env.engine.layout import (
     BY_NAME,
     CONSTANT_FIELDS,
@@ -24,6 +30,7 @@ from tlf_env.engine.layout import (
     fields_of,
     rows_of,
 )
+from tlf_env.numerics.memory import zeros
 from tlf_env.numerics.pointers import by_pointer
 from tlf_env.numerics.rows import reader, slot_reader, slot_writer, writer
 from tlf_env.onboard.calibration import Belief
@@ -132,6 +139,9 @@ class Arrays(NamedTuple):
     sensor_scales: np.ndarray  # (entry,) of `sensor`
     weights: np.ndarray  # (RewardTerms,)
     previews: np.ndarray  # (preview,) int64, in control steps
+    changing: (
+        np.ndarray
+    )  # (channel,) int64: places of those that may change in every substep, in some variant
 
     def rows(self, name: str) -> np.ndarray:
         """A row of the engine's table by name, ``(field, robot, lane)``; a view."""
@@ -279,9 +289,11 @@ def make_arrays(
     ring = gap + 1 + late
     columns = padded(lanes)
 
-    def zeros(fields: int) -> np.ndarray:
-        return np.zeros((fields, robots, columns))
+    def rows_of_zeros(fields: int) -> np.ndarray:
+        return zeros((fields, robots, columns))
 
+    applied = rows_of_zeros(len(CHANNELS))
+    applied[:] = np.array([channel.nominal for channel in CHANNELS])[:, None, None]
     return Arrays(
         signals=np.array(
             [
@@ -295,25 +307,23 @@ def make_arrays(
         tables=table[None].copy(),
         variants=np.arange(lanes) % len(scenarios),
         routes=np.zeros(lanes, dtype=np.int64),
-        constants=zeros(CONSTANT_FIELDS),
+        constants=rows_of_zeros(CONSTANT_FIELDS),
         levels=np.zeros(lanes),
-        states=zeros(fields_of(Kind.STATE, Kind.CONTROL)),
-        processes=zeros(len(CHANNELS)),
-        applied=np.tile(
-            np.array([channel.nominal for channel in CHANNELS])[:, None, None], (1, robots, columns)
-        ),
+        states=rows_of_zeros(fields_of(Kind.STATE, Kind.CONTROL)),
+        processes=rows_of_zeros(len(CHANNELS)),
+        applied=applied,
         imposed=np.full((len(CHANNELS), robots, columns), np.nan),
-        torques=np.zeros((2, dead + 1, robots, columns)),
+        torques=zeros((2, dead + 1, robots, columns)),
         kinds=np.full((robots, columns), scenario.action_kind, dtype=np.int64),
-        inputs=zeros(PUSH_INPUT + len(Push._fields) if scenario.plant == "chipmunk" else 0),
-        samples=np.zeros((scenario.substeps, len(Sample._fields), robots, columns)),
-        fixes=np.zeros((len(Fix._fields), old + 1, robots, columns)),
+        inputs=rows_of_zeros(PUSH_INPUT + len(Push._fields) if scenario.plant == "chipmunk" else 0),
+        samples=zeros((scenario.substeps, len(Sample._fields), robots, columns)),
+        fixes=zeros((len(Fix._fields), old + 1, robots, columns)),
         dropped=np.zeros((ring, robots, columns), dtype=np.bool_),
-        messages=np.zeros((len(Message._fields), ring, robots, columns)),
-        ways=np.zeros((len(Way._fields), smoothing_slots(scenario, old), robots, columns)),
-        references=np.zeros((len(Reference._fields), lookahead + 1, robots, columns)),
-        paths=np.zeros((2, gap + window + 1, robots, columns)),
-        longest=np.zeros((robots, columns)),
+        messages=zeros((len(Message._fields), ring, robots, columns)),
+        ways=zeros((len(Way._fields), smoothing_slots(scenario, old), robots, columns)),
+        references=zeros((len(Reference._fields), lookahead + 1, robots, columns)),
+        paths=zeros((2, gap + window + 1, robots, columns)),
+        longest=zeros((robots, columns)),
         clock=np.zeros((lanes, 4), dtype=np.int64),
         seeds=np.zeros(lanes, dtype=np.int64),
         actions=np.zeros((lanes, robots, ACTION_SIZE)),
@@ -336,4 +346,5 @@ def make_arrays(
         sensor_scales=np.array([entry.scale for entry in sensor.values()]),
         weights=np.array([scenario.reward[name] for name in RewardTerms._fields]),
         previews=np.array(scenario.preview_steps, dtype=np.int64),
+        changing=changing_channels([one.disturbance for one in scenarios], scenario.adversary),
     )

@@ -133,6 +133,8 @@ class Order(NamedTuple):
     dead: float  # dead time of the torques, substeps
     fix_every: float  # substeps from a position fix to the next
     fix_delay: float  # age of a fix when it comes, substeps
+    measured: float  # substeps since a fix was due to be measured
+    arrived: float  # substeps since one was due to come
 
 
 class Traction(NamedTuple):
@@ -158,6 +160,23 @@ class YawRate(NamedTuple):
     """What the gyro reads."""
 
     reading: float  # rad/s
+
+
+class Increments(NamedTuple):
+    """Motion in a substep by the encoders: their steps (rad), distance (mm) and turn (rad)."""
+
+    step_l: float
+    step_r: float
+    u_1: float
+    u_2: float
+
+
+class Innovation(NamedTuple):
+    """Innovation of a position fix in world axes (mm), and its NIS; 0 without a fix."""
+
+    d_x: float
+    d_y: float
+    nis: float
 
 
 class Draw(NamedTuple):
@@ -232,6 +251,8 @@ ROWS = (
     Row("reading", Reading, Kind.SCRATCH),
     Row("fix", Fix, Kind.SCRATCH),
     Row("yaw_rate", YawRate, Kind.SCRATCH),
+    Row("increments", Increments, Kind.SCRATCH),
+    Row("innovation", Innovation, Kind.SCRATCH),
     Row("moved", Motion, Kind.SCRATCH),  # as the plant leaves it, before the pose is advanced
     Row("impulses", Contact, Kind.SCRATCH),
     Row("draw", Draw, Kind.SCRATCH),

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
 from tlf_env.disturbances.channels import (
@@ -19,6 +17,8 @@ from tlf_env.disturbances.channels import (
 from tlf_env.engine.layout import (
     Draw,
     Fix,
+    Increments,
+    Innovation,
     Order,
     Reading,
     Sample,
@@ -47,6 +47,8 @@ from tlf_env.onboard.slip_estimator import (
     SlipEstimate,
     correct_with_slip,
     predict_with_slip,
+    with_slip,
+    within_bounds,
 )
 from tlf_env.onboard.tracking import body_errors
 from tlf_env.physics.vehicle import Body, Motion, axle_midpoint, forward_and_yaw, odometry
@@ -73,8 +75,9 @@ FIX_NUMBERS = np.array(
 NOMINAL_FIXES = np.array([1.0, 0.0, 0.0, 0.0])
 
 NO_SLIP = SlipEstimate(*(0.0 for _ in SlipEstimate._fields))
-with_slip = replacing(SlipEstimate, "delta_1", "delta_2")
 with_position = replacing(Fix, "x", "y")
+with_way = replacing(Sensors, "way_x", "way_y")
+with_times = replacing(Order, "measured", "arrived")
 with_sensor_sums = replacing(
     Trace,
     "distance",
@@ -135,9 +138,29 @@ def measured_fix(body: Body, motion: Motion, effects: Effects, draw: Draw) -> Fi
 
 
 @law
+def first_times(order: Order, tick: int) -> Order:
+    """The order at a tick with the times since fixes were due; see :func:`next_times`."""
+    every, delay = int(order.fix_every), int(order.fix_delay)
+    if every == 1:
+        return with_times(order, 0.0, 0.0)
+    return with_times(order, float(tick % every), float((tick - delay) % every))
+
+
+@law
+def next_times(order: Order) -> Order:
+    """The order one substep later. A fix is due at every tick that is a multiple of ``fix_every``."""
+    measured, arrived = order.measured + 1.0, order.arrived + 1.0
+    return with_times(
+        order,
+        0.0 if measured >= order.fix_every else measured,
+        0.0 if arrived >= order.fix_every else arrived,
+    )
+
+
+@law
 def missing(effects: Effects, order: Order, draw: Draw) -> bool:
     """Whether no position is measured at a tick."""
-    if draw.tick % int(order.fix_every) != 0:
+    if order.measured > 0.0:
         return True
     if not effects.position_outage > 0.0:
         return False
@@ -171,54 +194,42 @@ def commanded_increments(
     return believed_odometry(wanted_l * dt, wanted_r * dt, body, belief)
 
 
-class Innovation(NamedTuple):
-    """Innovation of a position fix in world axes (mm), its NIS, and the estimated heading (rad)."""
-
-    d_x: float
-    d_y: float
-    nis: float
-    theta: float
-
-
 @law
 def sensed(
     reading: Reading,
     fix: Fix,
     yaw_rate: YawRate,
     commanded: WheelPair,
+    increments: Increments,
     sensors: Sensors,
     trace: Trace,
     innovation: Innovation,
-    step_l: float,
-    step_r: float,
-    way_x: float,
-    way_y: float,
-    u_1: float,
-    u_2: float,
+    theta: float,
     moved: float,
     turned: float,
     dt: float,
 ) -> tuple[Sensors, Trace, Sample]:
     """What is kept of a substep: encoders and way, sums over the control step, and the sample.
 
-    The steps of the encoders are in rad, the way is the sum of the estimator's own motions (mm), u₁ and u₂ are
-    the encoders' increments (mm, rad), ``moved`` and ``turned`` the sums of the estimator's.
+    ``sensors`` has the estimator's way (mm) after the substep, ``theta`` is its heading, ``moved`` and
+    ``turned`` are the sums of its motions.
     """
+    way_x, way_y = sensors.way_x, sensors.way_y
     from_x, from_y = (fix.way_x, fix.way_y) if fix.age > 0.0 else (way_x, way_y)
-    forward, right = body_errors(innovation.d_x, innovation.d_y, innovation.theta)
+    forward, right = body_errors(innovation.d_x, innovation.d_y, theta)
     return (
         Sensors(
             encoder_l=reading.left,
             encoder_r=reading.right,
-            speed_l=step_l / dt,
-            speed_r=step_r / dt,
+            speed_l=increments.step_l / dt,
+            speed_r=increments.step_r / dt,
             way_x=way_x,
             way_y=way_y,
         ),
         with_sensor_sums(
             trace,
-            trace.distance + u_1,
-            trace.turn + u_2,
+            trace.distance + increments.u_1,
+            trace.turn + increments.u_2,
             moved,
             turned,
             trace.innovation_forward + fix.here * forward,
@@ -231,8 +242,8 @@ def sensed(
         Sample(
             fix_x=fix.x,
             fix_y=fix.y,
-            step_l=step_l,
-            step_r=step_r,
+            step_l=increments.step_l,
+            step_r=increments.step_r,
             has_fix=fix.here,
             fix_age=fix.age,
             gyro=yaw_rate.reading,
@@ -243,50 +254,39 @@ def sensed(
 
 
 @law
-def sense_robot(
+def odometry_of(body: Body, belief: Belief, reading: Reading, sensors: Sensors) -> Increments:
+    """Motion by the encoders since the last substep."""
+    step_l, step_r = reading.left - sensors.encoder_l, reading.right - sensors.encoder_r
+    u_1, u_2 = believed_odometry(step_l, step_r, body, belief)
+    return Increments(step_l, step_r, u_1, u_2)
+
+
+@law
+def predict_robot(
     body: Body,
     belief: Belief,
     ekf: Ekf,
     slip_ekf: SlipEkf,
     motion: Motion,
-    reading: Reading,
-    fix: Fix,
-    yaw_rate: YawRate,
-    commanded: WheelPair,
+    increments: Increments,
     sensors: Sensors,
     estimate: Estimate,
     slip: SlipEstimate,
-    trace: Trace,
     order: Order,
     substep: int,
     kind: int,
     dt: float,
-) -> tuple[Sensors, Estimate, SlipEstimate, Trace, Sample]:
-    """Wheel speeds and estimator (of the ``kind``) of one robot after a substep.
-
-    A fix that comes late is moved on by as much as the estimator moved its position since then.
-    """
-    step_l, step_r = reading.left - sensors.encoder_l, reading.right - sensors.encoder_r
-    u_1, u_2 = believed_odometry(step_l, step_r, body, belief)
-    way_x, way_y = sensors.way_x, sensors.way_y
-    d_x = d_y = nis = 0.0
+) -> tuple[Sensors, Estimate, SlipEstimate]:
+    """The estimator (of the ``kind``) of one robot after a substep, without a fix; and its way."""
+    u_1, u_2 = increments.u_1, increments.u_2
+    before_x, before_y = estimate.x, estimate.y
     if kind == EKF:
-        before_x, before_y = estimate.x, estimate.y
         estimate = predict(estimate, ekf, u_1, u_2)
-        way_x, way_y = way_x + (estimate.x - before_x), way_y + (estimate.y - before_y)
-        x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
-        y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
-        estimate, d_x, d_y, nis = correct(estimate, ekf, x, y, fix.here)
     elif kind == EKF_SLIP:
-        before_x, before_y = estimate.x, estimate.y
         commanded_1, commanded_2 = commanded_increments(order, body, belief, slip, substep, dt)
         estimate, slip = predict_with_slip(
             estimate, slip, slip_ekf, u_1, u_2, commanded_1, commanded_2, dt
         )
-        way_x, way_y = way_x + (estimate.x - before_x), way_y + (estimate.y - before_y)
-        x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
-        y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
-        estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y, fix.here)
     elif kind == TRUTH:
         true_x, true_y = axle_midpoint(motion, body.d)
         ahead, yaw = forward_and_yaw(motion)
@@ -303,25 +303,72 @@ def sense_robot(
             p_yt=0.0,
             p_tt=0.0,
         )
-    sensors, trace, sample = sensed(
+    if kind in (EKF, EKF_SLIP):
+        way_x = sensors.way_x + (estimate.x - before_x)
+        way_y = sensors.way_y + (estimate.y - before_y)
+        sensors = with_way(sensors, way_x, way_y)
+    return sensors, estimate, slip
+
+
+@law
+def correct_robot(
+    ekf: Ekf,
+    slip_ekf: SlipEkf,
+    fix: Fix,
+    sensors: Sensors,
+    estimate: Estimate,
+    slip: SlipEstimate,
+    kind: int,
+) -> tuple[Estimate, SlipEstimate, Innovation]:
+    """The estimator of one robot after a position fix, if there is one.
+
+    A fix that comes late is moved on by as much as the estimator moved its position since then.
+    """
+    d_x = d_y = nis = 0.0
+    x = fix.x + (sensors.way_x - fix.way_x) if fix.age > 0.0 else fix.x
+    y = fix.y + (sensors.way_y - fix.way_y) if fix.age > 0.0 else fix.y
+    if kind == EKF:
+        estimate, d_x, d_y, nis = correct(estimate, ekf, x, y, fix.here)
+    elif kind == EKF_SLIP:
+        estimate, slip, d_x, d_y, nis = correct_with_slip(estimate, slip, slip_ekf, x, y, fix.here)
+    return estimate, slip, Innovation(d_x, d_y, nis)
+
+
+@law
+def correct_without_fix(slip: SlipEstimate, slip_ekf: SlipEkf, kind: int) -> SlipEstimate:
+    """What :func:`correct_robot` changes where no fix has come."""
+    return within_bounds(slip, slip_ekf) if kind == EKF_SLIP else slip
+
+
+@law
+def account_robot(
+    reading: Reading,
+    fix: Fix,
+    yaw_rate: YawRate,
+    commanded: WheelPair,
+    increments: Increments,
+    sensors: Sensors,
+    estimate: Estimate,
+    slip: SlipEstimate,
+    trace: Trace,
+    innovation: Innovation,
+    dt: float,
+) -> tuple[Sensors, Trace, Sample]:
+    """:func:`sensed` with what the estimators of :func:`predict_robot` take as the robot's motion."""
+    return sensed(
         reading,
         fix,
         yaw_rate,
         commanded,
+        increments,
         sensors,
         trace,
-        Innovation(d_x, d_y, nis, estimate.theta),
-        step_l,
-        step_r,
-        way_x,
-        way_y,
-        u_1,
-        u_2,
-        trace.moved + u_1 - slip.spin_1 + slip.delta_1 * dt,
-        trace.turned + u_2 - slip.spin_2 + slip.delta_2 * dt,
+        innovation,
+        estimate.theta,
+        trace.moved + increments.u_1 - slip.spin_1 + slip.delta_1 * dt,
+        trace.turned + increments.u_2 - slip.spin_2 + slip.delta_2 * dt,
         dt,
     )
-    return sensors, estimate, slip, trace, sample
 
 
 @law
@@ -340,18 +387,19 @@ def sense_with_gyro(
     trace: Trace,
     dt: float,
 ) -> tuple[Sensors, Estimate, SlipEstimate, GyroEstimate, Trace, Sample]:
-    """As :func:`sense_robot`, with the estimator that uses the gyro and the torques."""
-    step_l, step_r = reading.left - sensors.encoder_l, reading.right - sensors.encoder_r
-    u_1, u_2 = believed_odometry(step_l, step_r, body, belief)
+    """Wheel speeds, and the estimator that uses the gyro and the torques, of one robot after a substep."""
+    increments = odometry_of(body, belief, reading, sensors)
     before_x, before_y = estimate.x, estimate.y
     torque = commanded.left + commanded.right
-    estimate, found = predict_with_gyro(estimate, found, ekf, u_1, yaw_rate.reading, torque, dt)
+    estimate, found = predict_with_gyro(
+        estimate, found, ekf, increments.u_1, yaw_rate.reading, torque, dt
+    )
     way_x = sensors.way_x + (estimate.x - before_x)
     way_y = sensors.way_y + (estimate.y - before_y)
     x = fix.x + (way_x - fix.way_x) if fix.age > 0.0 else fix.x
     y = fix.y + (way_y - fix.way_y) if fix.age > 0.0 else fix.y
     estimate, found, d_x, d_y, nis = correct_with_gyro(
-        estimate, found, ekf, x, y, fix.here, u_2, yaw_rate.reading, dt
+        estimate, found, ekf, x, y, fix.here, increments.u_2, yaw_rate.reading, dt
     )
     delta_1, delta_2 = reported_slip(found, ekf)
     turned = (yaw_rate.reading * (1.0 + found.scale_error) + found.gyro_error) * dt
@@ -360,15 +408,11 @@ def sense_with_gyro(
         fix,
         yaw_rate,
         commanded,
-        sensors,
+        increments,
+        with_way(sensors, way_x, way_y),
         trace,
-        Innovation(d_x, d_y, nis, estimate.theta),
-        step_l,
-        step_r,
-        way_x,
-        way_y,
-        u_1,
-        u_2,
+        Innovation(d_x, d_y, nis),
+        estimate.theta,
         trace.moved + found.advance + found.speed_error * dt,
         trace.turned + turned,
         dt,

@@ -37,6 +37,7 @@ from tlf_env.engine.layout import (
     TILE_ROWS,
     Draw,
     Fix,
+    Innovation,
     Order,
     Reading,
     Sample,
@@ -55,11 +56,17 @@ from tlf_env.engine.sensors import (
     NOMINAL_ENCODERS,
     NOMINAL_FIXES,
     NOMINAL_GYRO,
+    account_robot,
+    correct_robot,
+    correct_without_fix,
     disturbed_encoders,
+    first_times,
     gyro_reading,
     measured_fix,
     missing,
-    sense_robot,
+    next_times,
+    odometry_of,
+    predict_robot,
     sense_with_gyro,
     with_outlier,
 )
@@ -76,10 +83,24 @@ from tlf_env.engine.substeps import (
     with_grip,
 )
 from tlf_env.numerics.compiled import allocating, block, law, view
-from tlf_env.numerics.rows import replacing
-from tlf_env.onboard.kinds import EKF_GYRO
+from tlf_env.numerics.memory import prefetch, shaped, table
+from tlf_env.numerics.rows import choosing, replacing
+from tlf_env.onboard.kinds import EKF, EKF_GYRO, EKF_SLIP
 from tlf_env.onboard.speed_observer import observed_speeds
-from tlf_env.physics.vehicle import Push, advance_pose, follow_wheels, roll, slide
+from tlf_env.physics.vehicle import (
+    SLIDE_COLUMNS,
+    SLIDE_ROWS,
+    Contact,
+    Motion,
+    Push,
+    advance_pose,
+    begin_slide,
+    end_slide,
+    follow_wheels,
+    roll,
+    slide,
+    sweep_together,
+)
 from tlf_env.task.actions import EXTERNAL_TORQUE, TORQUE
 
 WIDTH = 8  # robots in a tile: doubles in the widest vectors there are
@@ -95,6 +116,8 @@ LIMITING = np.array(
 )
 NOT_PULLING = np.zeros(len(PULLING))
 NOT_LIMITING = np.array([0.0, 0.0, 1.0, 1.0])
+
+MOST_ALONE = 2  # sliding robots of a tile that are faster one by one than side by side
 
 SPEED_OBSERVERS = np.array([in_tile("speed_observer", "angle")])
 NO_SPEED_OBSERVER = np.zeros(1)
@@ -126,7 +149,10 @@ push_of, set_push = tile_access("push")
 reading_of, set_reading = tile_access("reading")
 moved_of, set_moved = tile_access("moved")
 impulses_of, set_impulses = tile_access("impulses")
+increments_of, set_increments = tile_access("increments")
+innovation_of, set_innovation = tile_access("innovation")
 draw_of, set_draw = tile_access("draw")  # of the tile as whole numbers
+chosen_motion, chosen_contact = choosing(Motion), choosing(Contact)
 with_speeds = replacing(Sensors, "speed_l", "speed_r")
 TICK = in_tile("draw", "tick")
 ROLLS = in_tile("rolls", "all")
@@ -134,8 +160,9 @@ COLUMN = in_tile("column", "place")
 FIX_X, FIX_Y, HERE, WAY_X, WAY_Y = (
     Fix._fields.index(name) for name in ("x", "y", "here", "way_x", "way_y")
 )
-LAST_X, LAST_Y = Sample._fields.index("fix_x"), Sample._fields.index("fix_y")
 SAMPLE, SAMPLE_FIELDS = in_tile("sample"), len(Sample._fields)
+LAST_X, LAST_Y = in_tile("sample", "fix_x"), in_tile("sample", "fix_y")
+LAST_FIX = np.array([Sample._fields.index("fix_x"), Sample._fields.index("fix_y")])
 
 
 @view
@@ -172,6 +199,36 @@ def store(
     for f in range(fields):
         for i in range(count):
             array[f, columns[i]] = tile[first + f, i]
+
+
+@law
+def columns_after(lanes: np.ndarray, lanes_in_all: int, item: int, items: int) -> tuple[int, int]:
+    """First and last column of the tile that begins with an item; after the last, of the lanes that follow.
+
+    Where the next call takes other lanes, nothing is lost but a little time.
+    """
+    number = lanes.shape[0]
+    if item < items:
+        last = min(item + WIDTH, items) - 1
+        return (
+            item // number * lanes_in_all + lanes[item % number],
+            last // number * lanes_in_all + lanes[last % number],
+        )
+    following = lanes[number - 1] + 1
+    return min(following, lanes_in_all - 1), min(following + WIDTH, lanes_in_all) - 1
+
+
+@law
+def ask_for(
+    constants: np.ndarray, states: np.ndarray, columns: tuple[int, int], row: int, rows: int
+) -> None:
+    """Have so many rows from ``row`` on, of constants and then states, brought to the cache for later."""
+    for k in range(row, min(row + rows, constants.shape[0] + STATE_FIELDS)):
+        for column in columns:
+            if k < constants.shape[0]:
+                prefetch(constants, k, column)
+            else:
+                prefetch(states, k - constants.shape[0], column)
 
 
 @law
@@ -217,8 +274,10 @@ def assign(
             dead=dead,
             fix_every=every,
             fix_delay=late,
+            measured=0.0,
+            arrived=0.0,
         )
-        set_order(tile, i, order)
+        set_order(tile, i, first_times(order, arrays.clock[lane, 0]))
 
 
 @block
@@ -228,7 +287,8 @@ def change_effects(arrays: Arrays, tile: np.ndarray, count: int, settings: Setti
     changed = False
     for i in range(count):
         draw, column = draw_of(whole(tile), i), whole(tile)[COLUMN, i]
-        changed |= refresh(arrays, column % lanes, draw.robot, OF_SUBSTEPS, draw.tick, 1, settings)
+        lane, robot = column % lanes, draw.robot
+        changed |= refresh(arrays, lane, robot, arrays.changing, draw.tick, 1, settings)
     if changed:
         load_effects(tile, flat(arrays.applied), columns_of(tile))
 
@@ -359,6 +419,54 @@ def hand_over(inputs: np.ndarray, lanes: int, tile: np.ndarray, count: int) -> N
         write_push(inputs, robot, lane, push_of(tile, i))
 
 
+@block
+def slide_alone(tile: np.ndarray, count: int, dt: float) -> None:
+    """By sweeps, robot by robot, those whose wheels do not all roll."""
+    tile = shaped(tile, TILE_ROWS, WIDTH)
+    for i in range(count):
+        if tile[ROLLS, i] == 0.0:
+            body, traction = body_of(tile, i), traction_of(tile, i)
+            motion, impulses = slide(
+                body,
+                motion_of(tile, i),
+                contact_of(tile, i),
+                floor_under(body, effects_of(tile, i), traction),
+                push_of(tile, i),
+                traction.delivered_l,
+                traction.delivered_r,
+                dt,
+            )
+            set_moved(tile, i, motion)
+            set_impulses(tile, i, impulses)
+
+
+@block
+def slide_together(tile: np.ndarray, dt: float) -> None:
+    """By sweeps, side by side, those whose wheels do not all roll."""
+    tile, sweeps = shaped(tile, TILE_ROWS, WIDTH), table(SLIDE_ROWS, SLIDE_COLUMNS)
+    for i in range(WIDTH):
+        body, traction = body_of(tile, i), traction_of(tile, i)
+        begin_slide(
+            sweeps,
+            i,
+            tile[ROLLS, i] == 0.0,
+            body,
+            motion_of(tile, i),
+            contact_of(tile, i),
+            floor_under(body, effects_of(tile, i), traction),
+            push_of(tile, i),
+            traction.delivered_l,
+            traction.delivered_r,
+            dt,
+        )
+    sweep_together(sweeps)
+    for i in range(WIDTH):
+        slides = tile[ROLLS, i] == 0.0
+        motion, impulses = end_slide(sweeps, i, motion_of(tile, i), dt)
+        set_moved(tile, i, chosen_motion(slides, motion, moved_of(tile, i)))
+        set_impulses(tile, i, chosen_contact(slides, impulses, impulses_of(tile, i)))
+
+
 @law
 def move(tile: np.ndarray, count: int, dt: float) -> None:
     """The plant: all in closed form, then by sweeps those whose wheels do not all roll."""
@@ -377,21 +485,14 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
         set_moved(tile, i, motion)
         set_impulses(tile, i, impulses)
         tile[ROLLS, i] = 1.0 if rolls else 0.0
+    sliding = 0
     for i in range(count):
         if tile[ROLLS, i] == 0.0:
-            body, traction = body_of(tile, i), traction_of(tile, i)
-            motion, impulses = slide(
-                body,
-                motion_of(tile, i),
-                contact_of(tile, i),
-                floor_under(body, effects_of(tile, i), traction),
-                push_of(tile, i),
-                traction.delivered_l,
-                traction.delivered_r,
-                dt,
-            )
-            set_moved(tile, i, motion)
-            set_impulses(tile, i, impulses)
+            sliding += 1
+    if sliding > MOST_ALONE:
+        slide_together(tile, dt)
+    elif sliding > 0:
+        slide_alone(tile, count, dt)
     for i in range(WIDTH):
         motion, impulses = moved_of(tile, i), impulses_of(tile, i)
         limit = body_of(tile, i).torque_limit
@@ -428,15 +529,44 @@ def needs_of(tile: np.ndarray) -> Needs:
     )
 
 
+class DueFixes(NamedTuple):
+    """Whether a fix is due to be measured, or to come, for some robot of a tile."""
+
+    measured: bool
+    come: bool
+
+
+@law
+def count_to_fixes(tile: np.ndarray) -> DueFixes:
+    """Go on to the next substep in the robots' times since fixes were due."""
+    measured = come = False
+    for i in range(WIDTH):
+        order = next_times(order_of(tile, i))
+        set_order(tile, i, order)
+        measured |= order.measured == 0.0
+        come |= order.arrived == 0.0
+    return DueFixes(measured, come)
+
+
+@law
+def measure_fixes(tile: np.ndarray) -> None:
+    """A position fix of every robot, at once."""
+    for i in range(WIDTH):
+        motion, effects = motion_of(tile, i), effects_of(tile, i)
+        set_fix(tile, i, measured_fix(body_of(tile, i), motion, effects, draw_of(whole(tile), i)))
+
+
+@law
+def repeat_fixes(tile: np.ndarray, dt: float) -> None:
+    """No fix for any robot; the last one is repeated."""
+    for i in range(WIDTH):
+        age = order_of(tile, i).fix_delay * dt
+        x, y = tile[LAST_X, i], tile[LAST_Y, i]
+        set_fix(tile, i, Fix(x=x, y=y, here=0.0, age=age, way_x=0.0, way_y=0.0))
+
+
 @block
-def deliver_fixes(
-    ring: np.ndarray,
-    samples: np.ndarray,
-    tile: np.ndarray,
-    substep: int,
-    count: int,
-    settings: Settings,
-) -> None:
+def deliver_fixes(ring: np.ndarray, tile: np.ndarray, count: int, settings: Settings) -> None:
     """Position fixes that come seldom, late, never or far off; ``ring`` (Fix, slot, column) keeps them."""
     slots = ring.shape[1]
     for i in range(count):
@@ -444,13 +574,17 @@ def deliver_fixes(
         order, effects, fix = order_of(tile, i), effects_of(tile, i), fix_of(tile, i)
         delay = int(order.fix_delay)
         here = 0.0 if missing(effects, order, draw) else 1.0
-        fix = with_outlier(fix, effects, draw)
+        if here > 0.0:
+            fix = with_outlier(fix, effects, draw)
         x, y, way_x, way_y = fix.x, fix.y, 0.0, 0.0
         if delay > 0:
-            now, then = draw.tick % slots, (draw.tick - delay) % slots
-            ring[FIX_X, now, column], ring[FIX_Y, now, column], ring[HERE, now, column] = x, y, here
+            if order.measured == 0.0:
+                now = draw.tick % slots
+                ring[FIX_X, now, column], ring[FIX_Y, now, column] = x, y
+                ring[HERE, now, column] = here
             here = 0.0
-            if draw.tick > delay:
+            if order.arrived == 0.0 and draw.tick > delay:
+                then = (draw.tick - delay) % slots
                 x, y, here = (
                     ring[FIX_X, then, column],
                     ring[FIX_Y, then, column],
@@ -458,8 +592,7 @@ def deliver_fixes(
                 )
                 way_x, way_y = ring[WAY_X, then, column], ring[WAY_Y, then, column]
         if here == 0.0:
-            before = substep - 1 if substep > 0 else samples.shape[0] - 1
-            x, y = samples[before, LAST_X, column], samples[before, LAST_Y, column]
+            x, y = tile[LAST_X, i], tile[LAST_Y, i]
         set_fix(
             tile,
             i,
@@ -479,7 +612,7 @@ def keep_ways(ring: np.ndarray, tile: np.ndarray, count: int) -> None:
 
 @law
 def measure(tile: np.ndarray, needs: Needs, dt: float) -> None:
-    """Encoders, gyro and position fixes, one tick on."""
+    """Encoders and gyro, one tick on."""
     numbers = whole(tile)
     for i in range(WIDTH):
         numbers[TICK, i] += 1
@@ -501,14 +634,30 @@ def measure(tile: np.ndarray, needs: Needs, dt: float) -> None:
     else:
         for i in range(WIDTH):
             set_yaw_rate(tile, i, YawRate(motion_of(tile, i).w))
-    for i in range(WIDTH):
-        motion, effects = motion_of(tile, i), effects_of(tile, i)
-        set_fix(tile, i, measured_fix(body_of(tile, i), motion, effects, draw_of(numbers, i)))
 
 
 @law
-def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> None:
-    """Wheel speeds and estimators."""
+def correct_tile(tile: np.ndarray, estimator: int) -> None:
+    """The estimators' corrections by the fixes."""
+    for i in range(WIDTH):
+        estimate, slip, innovation = correct_robot(
+            ekf_of(tile, i),
+            slip_ekf_of(tile, i),
+            fix_of(tile, i),
+            sensors_of(tile, i),
+            estimate_of(tile, i),
+            slip_of(tile, i),
+            estimator,
+        )
+        set_estimate(tile, i, estimate)
+        if estimator == EKF_SLIP:
+            set_slip(tile, i, slip)
+        set_innovation(tile, i, innovation)
+
+
+@law
+def sense_tile(tile: np.ndarray, substep: int, estimator: int, fixes: bool, dt: float) -> None:
+    """Wheel speeds and estimators; without ``fixes`` none has come to any robot."""
     if estimator == EKF_GYRO:
         for i in range(WIDTH):
             sensors, estimate, slip, found, trace, sample = sense_with_gyro(
@@ -534,20 +683,19 @@ def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> Non
             set_sample(tile, i, sample)
         return
     for i in range(WIDTH):
-        sensors, estimate, slip, trace, sample = sense_robot(
-            body_of(tile, i),
-            belief_of(tile, i),
+        body, belief = body_of(tile, i), belief_of(tile, i)
+        increments = odometry_of(body, belief, reading_of(tile, i), sensors_of(tile, i))
+        set_increments(tile, i, increments)
+        sensors, estimate, slip = predict_robot(
+            body,
+            belief,
             ekf_of(tile, i),
             slip_ekf_of(tile, i),
             motion_of(tile, i),
-            reading_of(tile, i),
-            fix_of(tile, i),
-            yaw_rate_of(tile, i),
-            commanded_of(tile, i),
+            increments,
             sensors_of(tile, i),
             estimate_of(tile, i),
             slip_of(tile, i),
-            trace_of(tile, i),
             order_of(tile, i),
             substep,
             estimator,
@@ -556,6 +704,32 @@ def sense_tile(tile: np.ndarray, substep: int, estimator: int, dt: float) -> Non
         set_sensors(tile, i, sensors)
         set_estimate(tile, i, estimate)
         set_slip(tile, i, slip)
+    # A loop for each estimator: with both in one, the loop does not become vectors.
+    if fixes and estimator == EKF_SLIP:
+        correct_tile(tile, EKF_SLIP)
+    elif fixes and estimator == EKF:
+        correct_tile(tile, EKF)
+    else:
+        for i in range(WIDTH):
+            set_slip(
+                tile, i, correct_without_fix(slip_of(tile, i), slip_ekf_of(tile, i), estimator)
+            )
+            set_innovation(tile, i, Innovation(0.0, 0.0, 0.0))
+    for i in range(WIDTH):
+        sensors, trace, sample = account_robot(
+            reading_of(tile, i),
+            fix_of(tile, i),
+            yaw_rate_of(tile, i),
+            commanded_of(tile, i),
+            increments_of(tile, i),
+            sensors_of(tile, i),
+            estimate_of(tile, i),
+            slip_of(tile, i),
+            trace_of(tile, i),
+            innovation_of(tile, i),
+            dt,
+        )
+        set_sensors(tile, i, sensors)
         set_trace(tile, i, trace)
         set_sample(tile, i, sample)
 
@@ -594,7 +768,7 @@ def advance(
     settings: Settings,
 ) -> None:
     """:func:`advance_in` a tile of its own."""
-    advance_in(np.empty((TILE_ROWS, WIDTH)), arrays, lanes, begin, end, actuates, senses, settings)
+    advance_in(table(TILE_ROWS, WIDTH), arrays, lanes, begin, end, actuates, senses, settings)
 
 
 @law
@@ -618,8 +792,10 @@ def advance_in(
     samples = arrays.samples.reshape((*arrays.samples.shape[:2], robots * lanes_in_all))
     torques, patches, variants = arrays.torques, arrays.patches, arrays.variants
     fixes = arrays.fixes.reshape((*arrays.fixes.shape[:2], robots * lanes_in_all))
+    # All samples of a control step are kept for those who read them, otherwise only the last.
+    keeps = settings.has_parts or arrays.sensor_observations.shape[2] > 0
     columns = columns_of(tile)
-    items = lanes.shape[0] * robots
+    items, ahead = lanes.shape[0] * robots, constants.shape[0] + STATE_FIELDS
     for item in range(0, items, WIDTH):
         count = min(WIDTH, items - item)
         assign(arrays, tile, lanes, item, count, settings)
@@ -627,7 +803,15 @@ def advance_in(
         load(tile, STATES_IN_TILE, states, STATE_FIELDS, columns)
         load_effects(tile, applied, columns)
         needs = needs_of(tile)
+        if needs.fixes or settings.changing:  # the last fix of every robot
+            for f in range(LAST_FIX.shape[0]):
+                for i in range(WIDTH):
+                    tile[SAMPLE + LAST_FIX[f], i] = samples[begin - 1, LAST_FIX[f], columns[i]]
+        next_columns = columns_after(lanes, lanes_in_all, item + WIDTH, items)
         for substep in range(begin, end):
+            if end - begin > 1:
+                share = ahead // (end - begin) + 1
+                ask_for(constants, states, next_columns, (substep - begin) * share, share)
             if actuates:
                 if settings.changing:
                     change_effects(arrays, tile, count, settings)
@@ -652,16 +836,23 @@ def advance_in(
                         move(tile, count, settings.dt)
             if senses:
                 measure(tile, needs, settings.dt)
+                due = count_to_fixes(tile) if needs.fixes else DueFixes(True, True)
+                if due.measured:
+                    measure_fixes(tile)
                 if needs.fixes:
-                    deliver_fixes(fixes, samples, tile, substep, count, settings)
-                sense_tile(tile, substep, settings.estimator, settings.dt)
+                    if due.measured or due.come:
+                        deliver_fixes(fixes, tile, count, settings)
+                    else:
+                        repeat_fixes(tile, settings.dt)
+                sense_tile(tile, substep, settings.estimator, due.measured or due.come, settings.dt)
                 if needs.observers:
                     observe_wheels(tile, settings.dt)
-                if needs.fixes:
+                if needs.fixes and due.measured:
                     keep_ways(fixes, tile, count)
-                for f in range(SAMPLE_FIELDS):
-                    for i in range(count):
-                        samples[substep, f, columns[i]] = tile[SAMPLE + f, i]
+                if keeps or substep == end - 1:
+                    for f in range(SAMPLE_FIELDS):
+                        for i in range(count):
+                            samples[substep, f, columns[i]] = tile[SAMPLE + f, i]
         store(tile, STATES_IN_TILE, states, STATE_FIELDS, columns, count)
     if senses:
         for i in range(lanes.shape[0]):

@@ -105,6 +105,16 @@ def _setter(first: int) -> Callable[..., Any]:
     return found
 
 
+def choosing(row: type[Any]) -> Callable[..., Any]:
+    """Compiled ``choose(mask, row, other)``: the row where the mask is true, else the other, field by field."""
+    # Numba takes no conditional inside so many keywords.
+    lines = "\n".join(f"    {name} = a.{name} if m else b.{name}" for name in row._fields)
+    fields = ", ".join(row._fields)
+    scope: dict[str, Any] = {"Row": row}
+    exec(f"def choose(m, a, b):\n{lines}\n    return Row({fields})\n", scope)
+    return law(scope["choose"])
+
+
 def reader(row: type[Any], first: int = 0) -> Callable[..., Any]:
     """Compiled ``read(array, robot, lane)``: a named tuple from ``array[first + field, robot, lane]``."""
     get = _getter(row, first)

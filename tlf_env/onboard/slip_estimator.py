@@ -331,6 +331,19 @@ corrected_slip = replacing(
 )
 
 
+with_slip = replacing(SlipEstimate, "delta_1", "delta_2")
+
+
+@law
+def within_bounds(slip: SlipEstimate, ekf: SlipEkf) -> SlipEstimate:
+    """The slip estimates clipped to their bounds: all that :func:`correct_with_slip` changes without a fix."""
+    return with_slip(
+        slip,
+        min(max(slip.delta_1, -ekf.bound_1), ekf.bound_1),
+        min(max(slip.delta_2, -ekf.bound_2), ekf.bound_2),
+    )
+
+
 @law
 def correct_with_slip(
     estimate: Estimate, slip: SlipEstimate, ekf: SlipEkf, x: float, y: float, here: float = 1.0
@@ -360,24 +373,28 @@ def correct_with_slip(
     last_x, last_y = (d_x, d_y) if here > 0.0 else (slip.d_x, slip.d_y)
     return (
         corrected_pose(estimate, gain, d_x, d_y),
-        corrected_slip(
-            slip,
-            delta_1=min(max(delta_1, -ekf.bound_1), ekf.bound_1),
-            delta_2=min(max(delta_2, -ekf.bound_2), ekf.bound_2),
-            p_x1=slip.p_x1 - gain.xx * slip.p_x1 - gain.xy * slip.p_y1,
-            p_y1=slip.p_y1 - gain.yx * slip.p_x1 - gain.yy * slip.p_y1,
-            p_t1=slip.p_t1 - gain.tx * slip.p_x1 - gain.ty * slip.p_y1,
-            p_x2=slip.p_x2 - gain.xx * slip.p_x2 - gain.xy * slip.p_y2,
-            p_y2=slip.p_y2 - gain.yx * slip.p_x2 - gain.yy * slip.p_y2,
-            p_t2=slip.p_t2 - gain.tx * slip.p_x2 - gain.ty * slip.p_y2,
-            p_11=slip.p_11 - l_1x * slip.p_x1 - l_1y * slip.p_y1,
-            p_12=slip.p_12 - l_1x * slip.p_x2 - l_1y * slip.p_y2,
-            p_22=slip.p_22 - l_2x * slip.p_x2 - l_2y * slip.p_y2,
-            variance=slip.variance + here * ekf.variance_weight * (0.25 * step_2 - known),
-            d_x=last_x,
-            d_y=last_y,
-            mean_forward=slip.mean_forward + here * ekf.mean_weight * (forward - slip.mean_forward),
-            mean_right=slip.mean_right + here * ekf.mean_weight * (right - slip.mean_right),
+        within_bounds(
+            corrected_slip(
+                slip,
+                delta_1=delta_1,
+                delta_2=delta_2,
+                p_x1=slip.p_x1 - gain.xx * slip.p_x1 - gain.xy * slip.p_y1,
+                p_y1=slip.p_y1 - gain.yx * slip.p_x1 - gain.yy * slip.p_y1,
+                p_t1=slip.p_t1 - gain.tx * slip.p_x1 - gain.ty * slip.p_y1,
+                p_x2=slip.p_x2 - gain.xx * slip.p_x2 - gain.xy * slip.p_y2,
+                p_y2=slip.p_y2 - gain.yx * slip.p_x2 - gain.yy * slip.p_y2,
+                p_t2=slip.p_t2 - gain.tx * slip.p_x2 - gain.ty * slip.p_y2,
+                p_11=slip.p_11 - l_1x * slip.p_x1 - l_1y * slip.p_y1,
+                p_12=slip.p_12 - l_1x * slip.p_x2 - l_1y * slip.p_y2,
+                p_22=slip.p_22 - l_2x * slip.p_x2 - l_2y * slip.p_y2,
+                variance=slip.variance + here * ekf.variance_weight * (0.25 * step_2 - known),
+                d_x=last_x,
+                d_y=last_y,
+                mean_forward=slip.mean_forward
+                + here * ekf.mean_weight * (forward - slip.mean_forward),
+                mean_right=slip.mean_right + here * ekf.mean_weight * (right - slip.mean_right),
+            ),
+            ekf,
         ),
         d_x,
         d_y,

@@ -1,12 +1,15 @@
 """The wheel kernel: one substep of one robot, implicit in all friction (``docs/physics.md``).
 
 Frames are taken at mid attitude, and torques and pushes enter as impulses. Then the impulses of floor and
-friction are solved: in closed form if all wheels roll (:func:`roll`), otherwise by sweeps (:func:`slide`).
+friction are solved: in closed form if all wheels roll (:func:`roll`), otherwise by sweeps (:func:`slide`, or
+for several robots at once :func:`begin_slide`, :func:`sweep_together` and :func:`end_slide`).
 """
 
 from __future__ import annotations
 
 from typing import NamedTuple
+
+import numpy as np
 
 from tlf_env.numerics.compiled import block, law
 from tlf_env.numerics.rows import replacing
@@ -14,8 +17,12 @@ from tlf_env.numerics.trig import sincos
 from tlf_env.physics.friction_limits import FrictionLimits, friction_limits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.rolling import rolling
+from tlf_env.physics.sliding import COLUMNS, ROWS, begin, end
 from tlf_env.physics.state import Contact, Floor, Motion, Push, Rates
 from tlf_env.physics.sweeps import sweep
+
+SLIDE_ROWS, SLIDE_COLUMNS = ROWS + 2, COLUMNS  # the sweeps' rows, and two for the heading
+SIN_T, COS_T = ROWS, ROWS + 1
 
 with_torques = replacing(Rates, "w", "omega_l", "omega_r")
 
@@ -75,15 +82,18 @@ def substep_frame(
 
 
 @law
-def moved(motion: Motion, frame: SubstepFrame, after: Rates, dt: float) -> Motion:
-    """The motion with new velocities, in world axes; fork and wheel angles are advanced with them."""
+def moved(motion: Motion, sin_t: float, cos_t: float, after: Rates, dt: float) -> Motion:
+    """The motion with new velocities, in world axes by the heading at mid attitude.
+
+    Fork and wheel angles are advanced with them.
+    """
     return Motion(
         x=motion.x,
         y=motion.y,
         theta=motion.theta,
         psi=motion.psi + dt * after.s,
-        v_x=frame.cos_t * after.v_e - frame.sin_t * after.v_f,
-        v_y=frame.sin_t * after.v_e + frame.cos_t * after.v_f,
+        v_x=cos_t * after.v_e - sin_t * after.v_f,
+        v_y=sin_t * after.v_e + cos_t * after.v_f,
         w=after.w,
         s=after.s,
         omega_l=after.omega_l,
@@ -110,7 +120,11 @@ def roll(
     rolls, after, impulses = rolling(
         body, frame.free, frame.before, frame.cos_p, frame.sin_p, floor, frame.limits
     )
-    return rolls and floor.creep == 0.0, moved(motion, frame, after, dt), impulses
+    return (
+        rolls and floor.creep == 0.0,
+        moved(motion, frame.sin_t, frame.cos_t, after, dt),
+        impulses,
+    )
 
 
 @law
@@ -129,7 +143,48 @@ def slide(
     after, impulses = sweep(
         body, frame.free, contact, frame.cos_p, frame.sin_p, floor, frame.limits
     )
-    return moved(motion, frame, after, dt), impulses
+    return moved(motion, frame.sin_t, frame.cos_t, after, dt), impulses
+
+
+@law
+def begin_slide(
+    table: np.ndarray,
+    column: int,
+    slides: bool,
+    body: Body,
+    motion: Motion,
+    contact: Contact,
+    floor: Floor,
+    push: Push,
+    torque_l: float,
+    torque_r: float,
+    dt: float,
+) -> None:
+    """Prepare :func:`slide` of a robot in a column of a table for :func:`sweep_together`.
+
+    The table has the shape ``(SLIDE_ROWS, SLIDE_COLUMNS)``; a robot that does not slide is left as it is.
+    """
+    frame = substep_frame(body, motion, contact, floor, push, torque_l, torque_r, dt)
+    begin(
+        table,
+        column,
+        slides,
+        body,
+        frame.free,
+        contact,
+        frame.cos_p,
+        frame.sin_p,
+        floor,
+        frame.limits,
+    )
+    table[SIN_T, column], table[COS_T, column] = frame.sin_t, frame.cos_t
+
+
+@law
+def end_slide(table: np.ndarray, column: int, motion: Motion, dt: float) -> tuple[Motion, Contact]:
+    """The result of :func:`slide` for the robot in a column."""
+    after, impulses = end(table, column)
+    return moved(motion, table[SIN_T, column], table[COS_T, column], after, dt), impulses
 
 
 @block

@@ -3,6 +3,8 @@
 Block Gauss–Seidel on impulses over left wheel, right wheel and castor. For each block its impulses are
 removed from the velocities, solved exactly, and added again. Axes: e to the right and f forward in the
 body; across (⊥, x) and along (∥, y) the castor's fork.
+
+The laws here are of one robot. :func:`sweep` runs them for one, :mod:`tlf_env.physics.sliding` for many.
 """
 
 from __future__ import annotations
@@ -10,8 +12,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-from tlf_env.numerics.compiled import law
-from tlf_env.physics.friction import disc
+from tlf_env.numerics.compiled import block, law
+from tlf_env.numerics.rows import replacing
+from tlf_env.physics.friction import Circle, disc
 from tlf_env.physics.friction_limits import FrictionLimits
 from tlf_env.physics.parameters import Body
 from tlf_env.physics.state import Contact, Floor, Rates
@@ -20,136 +23,360 @@ SWEEP_TOLERANCE_MM_S = 1e-9
 SWEEP_CAP = (
     1000  # a sticking castor at an angle can need hundreds of sweeps; most substeps need few
 )
+LEFT, RIGHT = 1.0, -1.0
+
+
+class Sweep(NamedTuple):
+    """Impulses as in :class:`~tlf_env.physics.state.Contact`, the velocities with them, and both tyres' λ."""
+
+    p_le: float
+    p_lf: float
+    p_re: float
+    p_rf: float
+    p_cx: float
+    p_cy: float
+    q_l: float
+    q_r: float
+    q_c: float
+    q_s: float
+    v_e: float
+    v_f: float
+    w: float
+    s: float
+    omega_l: float
+    omega_r: float
+    omega_c: float
+    lam_l: float
+    lam_r: float
+
+
+class Wheel(NamedTuple):
+    """A wheel and its axle. Velocities and ``omega_0`` exclude the impulses of this wheel."""
+
+    radius: float
+    inertia: float
+    inverse_inertia: float
+    w_ee: float  # inverse mass at the contact with a sticking axle, the tyre's compliance added
+    w_ff: float
+    w_ef: float
+    w_ff_turning: float  # with a sliding axle
+    b_e: float  # velocity of the contact without the wheel's spin
+    b_f: float
+    omega_0: float
+    friction: float  # largest impulse of the axle
+    grip: float  # largest impulse of the tyre
+
+
+class Solution(NamedTuple):
+    """Impulses of a tyre and of its axle, the wheel's spin, and λ of the tyre."""
+
+    p_e: float
+    p_f: float
+    q: float
+    omega: float
+    lam: float
+
+
+class Lifted(NamedTuple):
+    """Velocities of body and fork without the impulses of one block."""
+
+    v_e: float
+    v_f: float
+    w: float
+    s: float
+
+
+with_left = replacing(Sweep, "p_le", "p_lf", "q_l", "omega_l", "lam_l", "v_e", "v_f", "w")
+with_right = replacing(Sweep, "p_re", "p_rf", "q_r", "omega_r", "lam_r", "v_e", "v_f", "w")
+with_fork = replacing(Sweep, "p_cx", "p_cy", "q_c", "q_s", "omega_c", "v_e", "v_f", "w", "s")
+
+
+@law
+def can_stick(wheel: Wheel) -> bool:
+    """Whether friction and tyre together can stop the axle in one substep."""
+    return wheel.inertia * abs(wheel.omega_0) <= wheel.friction + wheel.radius * wheel.grip
+
+
+@law
+def circle_if_stuck(wheel: Wheel) -> Circle:
+    """The tyre on an axle that does not turn."""
+    return Circle(wheel.w_ee, wheel.w_ff, wheel.w_ef, wheel.b_e, wheel.b_f, wheel.grip)
+
+
+@law
+def friction_if_stuck(wheel: Wheel, p_f: float) -> float:
+    """The axle's friction impulse that holds it against its tyre."""
+    return wheel.radius * p_f - wheel.inertia * wheel.omega_0
+
+
+@law
+def friction_if_turning(wheel: Wheel, may_stick: bool, q_stuck: float) -> float:
+    """The axle's friction impulse if it slides: against what would have been needed, or against its spin."""
+    opposing = math.copysign(wheel.friction, wheel.omega_0)
+    return math.copysign(wheel.friction, q_stuck) if may_stick else -opposing
+
+
+@law
+def circle_if_turning(wheel: Wheel, q: float) -> Circle:
+    """The tyre on an axle that slides with the friction impulse ``q``."""
+    omega = wheel.omega_0 + q * wheel.inverse_inertia
+    b_f = wheel.b_f - wheel.radius * omega
+    return Circle(wheel.w_ee, wheel.w_ff_turning, wheel.w_ef, wheel.b_e, b_f, wheel.grip)
+
+
+@law
+def spin_if_turning(wheel: Wheel, q: float, p_f: float) -> float:
+    """The wheel's spin after both impulses."""
+    omega = wheel.omega_0 + q * wheel.inverse_inertia
+    return omega - wheel.radius * p_f * wheel.inverse_inertia
+
+
+@law
+def solve_wheel(wheel: Wheel) -> Solution:
+    """Solve one wheel: first with a sticking axle, then with a sliding axle."""
+    may_stick = can_stick(wheel)
+    q = 0.0
+    if may_stick:
+        circle = circle_if_stuck(wheel)
+        p_e, p_f, lam = disc(
+            circle.w_ee, circle.w_ff, circle.w_ef, circle.b_e, circle.b_f, circle.radius
+        )
+        q = friction_if_stuck(wheel, p_f)
+        if abs(q) <= wheel.friction:
+            return Solution(p_e, p_f, q, 0.0, lam)
+    q = friction_if_turning(wheel, may_stick, q)
+    circle = circle_if_turning(wheel, q)
+    p_e, p_f, lam = disc(
+        circle.w_ee, circle.w_ff, circle.w_ef, circle.b_e, circle.b_f, circle.radius
+    )
+    return Solution(p_e, p_f, q, spin_if_turning(wheel, q, p_f), lam)
+
+
+@law
+def without_drive_wheel(body: Body, side: float, sweep: Sweep) -> Lifted:
+    """Velocities without the impulses of the ``LEFT`` or the ``RIGHT`` tyre."""
+    if side == LEFT:
+        p_e, p_f = sweep.p_le, sweep.p_lf
+        w = sweep.w + (body.h * p_f + body.d * p_e) * body.inverse_I
+    else:
+        p_e, p_f = sweep.p_re, sweep.p_rf
+        w = sweep.w - (body.h * p_f - body.d * p_e) * body.inverse_I
+    return Lifted(
+        v_e=sweep.v_e - p_e * body.inverse_m,
+        v_f=sweep.v_f - p_f * body.inverse_m,
+        w=w,
+        s=sweep.s,
+    )
 
 
 @law
 def drive_wheel(
-    body: Body,
-    side: float,
-    v_e: float,
-    v_f: float,
-    w: float,
-    omega_0: float,
-    belt: float,
-    friction: float,
-    grip: float,
-    creep: float,
-) -> tuple[float, float, float, float, float]:
-    """Solve one drive wheel: first with a sticking axle, then with a sliding axle.
-
-    ``side`` is +1 left, −1 right; ``friction`` the largest impulse of the axle, ``grip`` that of the
-    tyre, ``creep`` its compliance below that. Velocities and ``omega_0`` exclude the impulses of this wheel.
-    Returns ``(p_e, p_f, q, ω, λ)``.
-    """
-    b_e = v_e - w * body.d
-    b_f = v_f - side * w * body.h - belt
-    w_ef = side * body.w_ef
-    # Skip the sticking case if friction and tyre together cannot stop the axle in one substep.
-    if body.J * abs(omega_0) <= friction + body.R * grip:
-        p_e, p_f, lam = disc(body.w_ee + creep, body.w_ff + creep, w_ef, b_e, b_f, grip)
-        q = body.R * p_f - body.J * omega_0
-        if abs(q) <= friction:
-            return p_e, p_f, q, 0.0, lam
-        q = math.copysign(friction, q)
+    body: Body, side: float, lifted: Lifted, free: Rates, floor: Floor, limits: FrictionLimits
+) -> Wheel:
+    """The ``LEFT`` or the ``RIGHT`` wheel."""
+    if side == LEFT:
+        omega_0, belt, creep = free.omega_l, floor.conveyor_l, limits.creep_l
+        friction, grip = limits.axle_l, limits.grip_l
     else:
-        q = -math.copysign(friction, omega_0)
-    omega = omega_0 + q * body.inverse_J
-    w_ff = body.w_ff + body.spin_drive + creep
-    p_e, p_f, lam = disc(body.w_ee + creep, w_ff, w_ef, b_e, b_f - body.R * omega, grip)
-    return p_e, p_f, q, omega - body.R * p_f * body.inverse_J, lam
+        omega_0, belt, creep = free.omega_r, floor.conveyor_r, limits.creep_r
+        friction, grip = limits.axle_r, limits.grip_r
+    return Wheel(
+        radius=body.R,
+        inertia=body.J,
+        inverse_inertia=body.inverse_J,
+        w_ee=body.w_ee + creep,
+        w_ff=body.w_ff + creep,
+        w_ef=side * body.w_ef,
+        w_ff_turning=body.w_ff + body.spin_drive + creep,
+        b_e=lifted.v_e - lifted.w * body.d,
+        b_f=lifted.v_f - side * lifted.w * body.h - belt,
+        omega_0=omega_0,
+        friction=friction,
+        grip=grip,
+    )
+
+
+@law
+def with_drive_wheel(
+    body: Body, side: float, sweep: Sweep, lifted: Lifted, wheel: Solution
+) -> Sweep:
+    """The sweep with the impulses of a drive wheel added."""
+    v_e = lifted.v_e + wheel.p_e * body.inverse_m
+    v_f = lifted.v_f + wheel.p_f * body.inverse_m
+    if side == LEFT:
+        w = lifted.w - (body.h * wheel.p_f + body.d * wheel.p_e) * body.inverse_I
+        return with_left(sweep, wheel.p_e, wheel.p_f, wheel.q, wheel.omega, wheel.lam, v_e, v_f, w)
+    w = lifted.w + (body.h * wheel.p_f - body.d * wheel.p_e) * body.inverse_I
+    return with_right(sweep, wheel.p_e, wheel.p_f, wheel.q, wheel.omega, wheel.lam, v_e, v_f, w)
+
+
+@law
+def castor_impulse(sweep: Sweep, cos_p: float, sin_p: float) -> tuple[float, float]:
+    """The castor's impulse in body axes."""
+    return (
+        sweep.p_cx * cos_p - sweep.p_cy * sin_p,
+        sweep.p_cx * sin_p + sweep.p_cy * cos_p,
+    )
+
+
+@law
+def without_castor(body: Body, sweep: Sweep, cos_p: float, sin_p: float) -> Lifted:
+    """Velocities without the impulses of castor and steering."""
+    p_ce, p_cf = castor_impulse(sweep, cos_p, sin_p)
+    return Lifted(
+        v_e=sweep.v_e - p_ce * body.inverse_m,
+        v_f=sweep.v_f - p_cf * body.inverse_m,
+        w=sweep.w - (body.q * p_ce - sweep.q_s) * body.inverse_I,
+        s=sweep.s - (body.T * sweep.p_cx + sweep.q_s) * body.inverse_I_s,
+    )
 
 
 @law
 def castor_wheel(
     body: Body,
     w_xx: float,
-    w_xy: float,
     w_yy: float,
+    w_xy: float,
     b_x: float,
     b_y: float,
-    omega_0: float,
-    friction: float,
-    grip: float,
-    creep: float,
-) -> tuple[float, float, float, float, float]:
-    """Solve the castor wheel for a given steering state, with the same two cases as a drive wheel.
-
-    ``b`` and ``W`` are velocity and inverse mass of the fork at the contact, without the wheel's spin.
-    Returns ``(p_⊥, p_∥, q_c, ω_c, λ)``.
-    """
-    if body.J_c * abs(omega_0) <= friction + body.R_c * grip:
-        p_x, p_y, lam = disc(w_xx + creep, w_yy + creep, w_xy, b_x, b_y, grip)
-        q = body.R_c * p_y - body.J_c * omega_0
-        if abs(q) <= friction:
-            return p_x, p_y, q, 0.0, lam
-        q = math.copysign(friction, q)
-    else:
-        q = -math.copysign(friction, omega_0)
-    omega = omega_0 + q * body.inverse_J_c
-    w_yy += body.spin_castor + creep
-    p_x, p_y, lam = disc(w_xx + creep, w_yy, w_xy, b_x, b_y - body.R_c * omega, grip)
-    return p_x, p_y, q, omega - body.R_c * p_y * body.inverse_J_c, lam
+    free: Rates,
+    limits: FrictionLimits,
+) -> Wheel:
+    """The castor's wheel for inverse mass and velocity of the fork at the contact."""
+    return Wheel(
+        radius=body.R_c,
+        inertia=body.J_c,
+        inverse_inertia=body.inverse_J_c,
+        w_ee=w_xx + limits.creep_c,
+        w_ff=w_yy + limits.creep_c,
+        w_ef=w_xy,
+        w_ff_turning=w_yy + (body.spin_castor + limits.creep_c),
+        b_e=b_x,
+        b_f=b_y,
+        omega_0=free.omega_c,
+        friction=limits.axle_c,
+        grip=limits.grip_c,
+    )
 
 
 @law
-def castor(
-    body: Body,
-    cos_phi: float,
-    sin_phi: float,
-    v_e: float,
-    v_f: float,
-    w: float,
-    s: float,
-    omega_0: float,
-    axle_friction: float,
-    steer_friction: float,
-    grip: float,
-    creep: float,
-) -> tuple[float, float, float, float, float, float, float, float]:
-    """Solve the castor: first with locked, then with sliding steering.
+def rate_if_locked(body: Body, lifted: Lifted) -> float:
+    """The rate at which body and fork turn as one."""
+    return (body.I * lifted.w + body.I_s * lifted.s) / (body.I + body.I_s)
 
-    Returns ``(p_⊥, p_∥, q_c, q_s, w, s, ω_c, λ)``.
-    """
+
+@law
+def castor_if_locked(
+    body: Body, lifted: Lifted, cos_p: float, sin_p: float, free: Rates, limits: FrictionLimits
+) -> Wheel:
+    """The castor's wheel while the steering is locked."""
     I_total = body.I + body.I_s
-    rate = (body.I * w + body.I_s * s) / I_total
-    lever = body.q * cos_phi + body.T
-    across = body.q * sin_phi
-    forward_x, forward_y = v_f * sin_phi, v_f * cos_phi
-    p_x, p_y, q_c, omega, lam = castor_wheel(
+    rate = rate_if_locked(body, lifted)
+    lever, across = body.q * cos_p + body.T, body.q * sin_p
+    return castor_wheel(
         body,
         body.inverse_m + lever * lever / I_total,
-        -lever * across / I_total,
         body.inverse_m + across * across / I_total,
-        (v_e + rate * body.q) * cos_phi + forward_x + body.T * rate,
-        -(v_e + rate * body.q) * sin_phi + forward_y,
-        omega_0,
-        axle_friction,
-        grip,
-        creep,
+        -lever * across / I_total,
+        (lifted.v_e + rate * body.q) * cos_p + lifted.v_f * sin_p + body.T * rate,
+        -(lifted.v_e + rate * body.q) * sin_p + lifted.v_f * cos_p,
+        free,
+        limits,
     )
-    locked = rate + (lever * p_x - across * p_y) / I_total
-    q_s = body.I_s * (locked - s) - body.T * p_x
-    if abs(q_s) <= steer_friction:
-        return p_x, p_y, q_c, q_s, locked, locked, omega, lam
 
-    q_s = math.copysign(steer_friction, q_s)
-    w_free, s_free = w - q_s * body.inverse_I, s + q_s * body.inverse_I_s
-    q_cos = body.q * cos_phi
-    p_x, p_y, q_c, omega, lam = castor_wheel(
+
+@law
+def turn_if_locked(
+    body: Body, lifted: Lifted, cos_p: float, sin_p: float, p_x: float, p_y: float
+) -> tuple[float, float]:
+    """The rate of body and fork after the tyre's impulse, and the friction impulse that locks the steering."""
+    lever, across = body.q * cos_p + body.T, body.q * sin_p
+    rate = rate_if_locked(body, lifted)
+    locked = rate + (lever * p_x - across * p_y) / (body.I + body.I_s)
+    return locked, body.I_s * (locked - lifted.s) - body.T * p_x
+
+
+@law
+def castor_if_steering(
+    body: Body,
+    lifted: Lifted,
+    q_s: float,
+    cos_p: float,
+    sin_p: float,
+    free: Rates,
+    limits: FrictionLimits,
+) -> Wheel:
+    """The castor's wheel while the steering slides with the friction impulse ``q_s``."""
+    w_free, s_free = lifted.w - q_s * body.inverse_I, lifted.s + q_s * body.inverse_I_s
+    q_cos, across = body.q * cos_p, body.q * sin_p
+    return castor_wheel(
         body,
         body.inverse_m + q_cos * q_cos * body.inverse_I + body.T * body.T * body.inverse_I_s,
-        -q_cos * across * body.inverse_I,
         body.inverse_m + across * across * body.inverse_I,
-        (v_e + w_free * body.q) * cos_phi + forward_x + body.T * s_free,
-        -(v_e + w_free * body.q) * sin_phi + forward_y,
-        omega_0,
-        axle_friction,
-        grip,
-        creep,
+        -q_cos * across * body.inverse_I,
+        (lifted.v_e + w_free * body.q) * cos_p + lifted.v_f * sin_p + body.T * s_free,
+        -(lifted.v_e + w_free * body.q) * sin_p + lifted.v_f * cos_p,
+        free,
+        limits,
     )
-    w_new = w_free + (q_cos * p_x - across * p_y) * body.inverse_I
-    s_new = s_free + body.T * p_x * body.inverse_I_s
-    return p_x, p_y, q_c, q_s, w_new, s_new, omega, lam
+
+
+@law
+def turn_if_steering(
+    body: Body, lifted: Lifted, q_s: float, cos_p: float, sin_p: float, p_x: float, p_y: float
+) -> tuple[float, float]:
+    """The rates of body and fork after the tyre's impulse."""
+    w_free, s_free = lifted.w - q_s * body.inverse_I, lifted.s + q_s * body.inverse_I_s
+    q_cos, across = body.q * cos_p, body.q * sin_p
+    return (
+        w_free + (q_cos * p_x - across * p_y) * body.inverse_I,
+        s_free + body.T * p_x * body.inverse_I_s,
+    )
+
+
+@law
+def with_castor(
+    body: Body,
+    sweep: Sweep,
+    cos_p: float,
+    sin_p: float,
+    wheel: Solution,
+    q_s: float,
+    w: float,
+    s: float,
+) -> Sweep:
+    """The sweep with new impulses of castor and steering."""
+    p_ce, p_cf = castor_impulse(sweep, cos_p, sin_p)
+    new_e = wheel.p_e * cos_p - wheel.p_f * sin_p
+    new_f = wheel.p_e * sin_p + wheel.p_f * cos_p
+    return with_fork(
+        sweep,
+        p_cx=wheel.p_e,
+        p_cy=wheel.p_f,
+        q_c=wheel.q,
+        q_s=q_s,
+        omega_c=wheel.omega,
+        v_e=sweep.v_e + (new_e - p_ce) * body.inverse_m,
+        v_f=sweep.v_f + (new_f - p_cf) * body.inverse_m,
+        w=w,
+        s=s,
+    )
+
+
+@law
+def solve_castor(
+    body: Body, sweep: Sweep, cos_p: float, sin_p: float, free: Rates, limits: FrictionLimits
+) -> Sweep:
+    """Solve the castor: first with locked, then with sliding steering."""
+    lifted = without_castor(body, sweep, cos_p, sin_p)
+    wheel = solve_wheel(castor_if_locked(body, lifted, cos_p, sin_p, free, limits))
+    locked, q_s = turn_if_locked(body, lifted, cos_p, sin_p, wheel.p_e, wheel.p_f)
+    if abs(q_s) <= limits.steering:
+        return with_castor(body, sweep, cos_p, sin_p, wheel, q_s, locked, locked)
+    q_s = math.copysign(limits.steering, q_s)
+    wheel = solve_wheel(castor_if_steering(body, lifted, q_s, cos_p, sin_p, free, limits))
+    w, s = turn_if_steering(body, lifted, q_s, cos_p, sin_p, wheel.p_e, wheel.p_f)
+    return with_castor(body, sweep, cos_p, sin_p, wheel, q_s, w, s)
 
 
 @law
@@ -193,6 +420,119 @@ def tyre_slips(body: Body, rates: Rates, floor: Floor, cos_p: float, sin_p: floa
 
 
 @law
+def begin_sweeps(body: Body, free: Rates, contact: Contact, cos_p: float, sin_p: float) -> Sweep:
+    """The impulses in ``contact``, and the velocities with them."""
+    p_le, p_lf, p_re, p_rf = contact.p_le, contact.p_lf, contact.p_re, contact.p_rf
+    p_cx, p_cy = contact.p_cx, contact.p_cy
+    q_l, q_r, q_c, q_s = contact.q_l, contact.q_r, contact.q_c, contact.q_s
+    p_ce, p_cf = p_cx * cos_p - p_cy * sin_p, p_cx * sin_p + p_cy * cos_p
+    return Sweep(
+        p_le=p_le,
+        p_lf=p_lf,
+        p_re=p_re,
+        p_rf=p_rf,
+        p_cx=p_cx,
+        p_cy=p_cy,
+        q_l=q_l,
+        q_r=q_r,
+        q_c=q_c,
+        q_s=q_s,
+        v_e=free.v_e + (p_le + p_re + p_ce) * body.inverse_m,
+        v_f=free.v_f + (p_lf + p_rf + p_cf) * body.inverse_m,
+        w=free.w
+        + (body.h * (p_rf - p_lf) - body.d * (p_le + p_re) + body.q * p_ce - q_s) * body.inverse_I,
+        s=free.s + (body.T * p_cx + q_s) * body.inverse_I_s,
+        omega_l=free.omega_l + (q_l - body.R * p_lf) * body.inverse_J,
+        omega_r=free.omega_r + (q_r - body.R * p_rf) * body.inverse_J,
+        omega_c=free.omega_c + (q_c - body.R_c * p_cy) * body.inverse_J_c,
+        lam_l=0.0,
+        lam_r=0.0,
+    )
+
+
+@law
+def change_of(body: Body, sweep: Sweep, before: Sweep) -> float:
+    """Largest change of a velocity by a sweep, mm/s."""
+    return max(
+        max(abs(sweep.v_e - before.v_e), abs(sweep.v_f - before.v_f)),
+        max(body.h * abs(sweep.w - before.w), body.T * abs(sweep.s - before.s)),
+        max(
+            body.R * abs(sweep.omega_l - before.omega_l),
+            body.R * abs(sweep.omega_r - before.omega_r),
+        ),
+        body.R_c * abs(sweep.omega_c - before.omega_c),
+    )
+
+
+@block
+def sweep_on(
+    body: Body,
+    free: Rates,
+    cos_p: float,
+    sin_p: float,
+    floor: Floor,
+    limits: FrictionLimits,
+    sweep: Sweep,
+    sweeps: int,
+) -> Sweep:
+    """Sweeps until the velocities no longer change, at most so many."""
+    for _ in range(sweeps):
+        before = sweep
+        for side in (LEFT, RIGHT):
+            lifted = without_drive_wheel(body, side, sweep)
+            wheel = solve_wheel(drive_wheel(body, side, lifted, free, floor, limits))
+            sweep = with_drive_wheel(body, side, sweep, lifted, wheel)
+        sweep = solve_castor(body, sweep, cos_p, sin_p, free, limits)
+        if change_of(body, sweep, before) < SWEEP_TOLERANCE_MM_S:
+            break
+    return sweep
+
+
+@law
+def end_sweeps(
+    body: Body,
+    sweep: Sweep,
+    cos_p: float,
+    sin_p: float,
+    floor: Floor,
+    limits: FrictionLimits,
+) -> tuple[Rates, Contact]:
+    """Velocities and impulses of a substep, from the last sweep."""
+    p_le, p_re = sweep.p_le, sweep.p_re
+    both_stick = sweep.lam_l == 0.0 and sweep.lam_r == 0.0 and floor.creep == 0.0
+    even_l, even_r = share_lateral(p_le, sweep.p_lf, p_re, sweep.p_rf, limits.grip_l, limits.grip_r)
+    p_le, p_re = even_l if both_stick else p_le, even_r if both_stick else p_re
+    after = Rates(
+        v_e=sweep.v_e,
+        v_f=sweep.v_f,
+        w=sweep.w,
+        s=sweep.s,
+        omega_l=sweep.omega_l,
+        omega_r=sweep.omega_r,
+        omega_c=sweep.omega_c,
+    )
+    slips = tyre_slips(body, after, floor, cos_p, sin_p)
+    return (
+        after,
+        Contact(
+            p_le=p_le,
+            p_lf=sweep.p_lf,
+            p_re=p_re,
+            p_rf=sweep.p_rf,
+            p_cx=sweep.p_cx,
+            p_cy=sweep.p_cy,
+            q_l=sweep.q_l,
+            q_r=sweep.q_r,
+            q_c=sweep.q_c,
+            q_s=sweep.q_s,
+            slip_l=math.sqrt(slips.e * slips.e + slips.lf * slips.lf),
+            slip_r=math.sqrt(slips.e * slips.e + slips.rf * slips.rf),
+            slip_c=math.sqrt(slips.cx * slips.cx + slips.cy * slips.cy),
+        ),
+    )
+
+
+@law
 def sweep(
     body: Body,
     free: Rates,
@@ -203,112 +543,6 @@ def sweep(
     limits: FrictionLimits,
 ) -> tuple[Rates, Contact]:
     """Velocities and impulses of a substep; the solution starts from the impulses in ``contact``."""
-    p_le, p_lf, p_re, p_rf = contact.p_le, contact.p_lf, contact.p_re, contact.p_rf
-    p_cx, p_cy = contact.p_cx, contact.p_cy
-    q_l, q_r, q_c, q_s = contact.q_l, contact.q_r, contact.q_c, contact.q_s
-    p_ce, p_cf = p_cx * cos_p - p_cy * sin_p, p_cx * sin_p + p_cy * cos_p
-    v_e = free.v_e + (p_le + p_re + p_ce) * body.inverse_m
-    v_f = free.v_f + (p_lf + p_rf + p_cf) * body.inverse_m
-    w = (
-        free.w
-        + (body.h * (p_rf - p_lf) - body.d * (p_le + p_re) + body.q * p_ce - q_s) * body.inverse_I
-    )
-    s = free.s + (body.T * p_cx + q_s) * body.inverse_I_s
-    omega_l = free.omega_l + (q_l - body.R * p_lf) * body.inverse_J
-    omega_r = free.omega_r + (q_r - body.R * p_rf) * body.inverse_J
-    omega_c = free.omega_c + (q_c - body.R_c * p_cy) * body.inverse_J_c
-    lam_l = lam_r = 0.0
-
-    for _ in range(SWEEP_CAP):
-        old_e, old_f, old_w, old_s = v_e, v_f, w, s
-        old_l, old_r, old_c = omega_l, omega_r, omega_c
-
-        v_e -= p_le * body.inverse_m
-        v_f -= p_lf * body.inverse_m
-        w += (body.h * p_lf + body.d * p_le) * body.inverse_I
-        p_le, p_lf, q_l, omega_l, lam_l = drive_wheel(
-            body,
-            1.0,
-            v_e,
-            v_f,
-            w,
-            free.omega_l,
-            floor.conveyor_l,
-            limits.axle_l,
-            limits.grip_l,
-            limits.creep_l,
-        )
-        v_e += p_le * body.inverse_m
-        v_f += p_lf * body.inverse_m
-        w -= (body.h * p_lf + body.d * p_le) * body.inverse_I
-
-        v_e -= p_re * body.inverse_m
-        v_f -= p_rf * body.inverse_m
-        w -= (body.h * p_rf - body.d * p_re) * body.inverse_I
-        p_re, p_rf, q_r, omega_r, lam_r = drive_wheel(
-            body,
-            -1.0,
-            v_e,
-            v_f,
-            w,
-            free.omega_r,
-            floor.conveyor_r,
-            limits.axle_r,
-            limits.grip_r,
-            limits.creep_r,
-        )
-        v_e += p_re * body.inverse_m
-        v_f += p_rf * body.inverse_m
-        w += (body.h * p_rf - body.d * p_re) * body.inverse_I
-
-        p_ce, p_cf = p_cx * cos_p - p_cy * sin_p, p_cx * sin_p + p_cy * cos_p
-        p_cx, p_cy, q_c, q_s, w, s, omega_c, _lam = castor(
-            body,
-            cos_p,
-            sin_p,
-            v_e - p_ce * body.inverse_m,
-            v_f - p_cf * body.inverse_m,
-            w - (body.q * p_ce - q_s) * body.inverse_I,
-            s - (body.T * p_cx + q_s) * body.inverse_I_s,
-            free.omega_c,
-            limits.axle_c,
-            limits.steering,
-            limits.grip_c,
-            limits.creep_c,
-        )
-        new_e, new_f = p_cx * cos_p - p_cy * sin_p, p_cx * sin_p + p_cy * cos_p
-        v_e += (new_e - p_ce) * body.inverse_m
-        v_f += (new_f - p_cf) * body.inverse_m
-
-        change = max(
-            max(abs(v_e - old_e), abs(v_f - old_f)),
-            max(body.h * abs(w - old_w), body.T * abs(s - old_s)),
-            max(body.R * abs(omega_l - old_l), body.R * abs(omega_r - old_r)),
-            body.R_c * abs(omega_c - old_c),
-        )
-        if change < SWEEP_TOLERANCE_MM_S:
-            break
-
-    if lam_l == 0.0 and lam_r == 0.0 and floor.creep == 0.0:
-        p_le, p_re = share_lateral(p_le, p_lf, p_re, p_rf, limits.grip_l, limits.grip_r)
-
-    after = Rates(v_e=v_e, v_f=v_f, w=w, s=s, omega_l=omega_l, omega_r=omega_r, omega_c=omega_c)
-    slips = tyre_slips(body, after, floor, cos_p, sin_p)
-    return (
-        after,
-        Contact(
-            p_le=p_le,
-            p_lf=p_lf,
-            p_re=p_re,
-            p_rf=p_rf,
-            p_cx=p_cx,
-            p_cy=p_cy,
-            q_l=q_l,
-            q_r=q_r,
-            q_c=q_c,
-            q_s=q_s,
-            slip_l=math.sqrt(slips.e * slips.e + slips.lf * slips.lf),
-            slip_r=math.sqrt(slips.e * slips.e + slips.rf * slips.rf),
-            slip_c=math.sqrt(slips.cx * slips.cx + slips.cy * slips.cy),
-        ),
-    )
+    begun = begin_sweeps(body, free, contact, cos_p, sin_p)
+    solved = sweep_on(body, free, cos_p, sin_p, floor, limits, begun, SWEEP_CAP)
+    return end_sweeps(body, solved, cos_p, sin_p, floor, limits)

@@ -12,7 +12,8 @@ state                  :class:`Motion` (pose and velocities) and :class:`Contact
                        memory, with the slip speeds)
 inputs of a substep    two torques, :class:`Floor` and :class:`Push`
 substep                :func:`roll` in closed form, and whether it holds; :func:`slide` in every case;
-                       :func:`substep` chooses between them
+                       :func:`substep` chooses between them; :func:`begin_slide`, :func:`sweep_together`
+                       and :func:`end_slide` are ``slide`` for ``SLIDE_COLUMNS`` robots in a table
 kinematic substep      :func:`follow_wheels`
 pose                   :func:`advance_pose`, :func:`axle_midpoint` (the point c that follows the
                        reference), :func:`forward_and_yaw`
@@ -28,7 +29,15 @@ Four more places outside this package depend on the wheels and have to be adapte
 :mod:`~tlf_env.physics.chipmunk_plant` do.
 """
 
-from tlf_env.physics.kernel import roll, slide, substep
+from tlf_env.physics.kernel import (
+    SLIDE_COLUMNS,
+    SLIDE_ROWS,
+    begin_slide,
+    end_slide,
+    roll,
+    slide,
+    substep,
+)
 from tlf_env.physics.kinematics import follow_wheels, odometry, wheel_speeds
 from tlf_env.physics.parameters import (
     Body,
@@ -40,6 +49,7 @@ from tlf_env.physics.parameters import (
     body_array,
     laden,
 )
+from tlf_env.physics.sliding import sweep_together
 from tlf_env.physics.state import (
     Contact,
     Floor,
@@ -52,6 +62,8 @@ from tlf_env.physics.state import (
 )
 
 __all__ = [
+    "SLIDE_COLUMNS",
+    "SLIDE_ROWS",
     "Body",
     "Contact",
     "Floor",
@@ -63,9 +75,11 @@ __all__ = [
     "RobotParameters",
     "advance_pose",
     "axle_midpoint",
+    "begin_slide",
     "body",
     "body_array",
     "conveyor",
+    "end_slide",
     "follow_wheels",
     "forward_and_yaw",
     "laden",
@@ -73,5 +87,6 @@ __all__ = [
     "roll",
     "slide",
     "substep",
+    "sweep_together",
     "wheel_speeds",
 ]

@@ -66,7 +66,8 @@ def time_gap_error(
         spare = distance(x, y, path[0, a], path[1, a]) - within
         if spare > longest:  # the next segments are farther away
             passed = int(min(spare / longest, 1.0 * (last - k))) if longest > 0.0 else last - k
-            k, a = k + passed, (a + passed) % slots
+            k, a = k + passed, a + passed
+            a = a - slots if a >= slots else a  # the ring holds more than the window
         else:
             b = a + 1 if a + 1 < slots else 0
             fraction, squared = nearest_on_segment(

@@ -1,0 +1,118 @@
+"""Sweeps side by side: every robot gets the bits that it gets alone, whatever the others need."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from physics_helpers import DT_S, random_start
+
+from tlf_env.numerics.compiled import driver
+from tlf_env.numerics.memory import table
+from tlf_env.numerics.rows import row_reader, row_writer
+from tlf_env.physics.parameters import Body, RobotParameters, body
+from tlf_env.physics.state import Contact, Floor, Motion, Push
+from tlf_env.physics.vehicle import (
+    SLIDE_COLUMNS,
+    SLIDE_ROWS,
+    begin_slide,
+    end_slide,
+    slide,
+    sweep_together,
+)
+
+body_of, motion_of, contact_of, floor_of = (
+    row_reader(row, 0) for row in (Body, Motion, Contact, Floor)
+)
+set_motion, set_contact = row_writer(Motion, 0), row_writer(Contact, 0)
+STEPS = 40
+
+
+@driver
+def alone(
+    bodies: np.ndarray,
+    motions: np.ndarray,
+    contacts: np.ndarray,
+    floors: np.ndarray,
+    torques: np.ndarray,
+    slides: np.ndarray,
+) -> None:
+    """One substep of the robots that slide, ``(field, robot)``."""
+    for i in range(motions.shape[1]):
+        if slides[i]:
+            motion, contact = slide(
+                body_of(bodies, i),
+                motion_of(motions, i),
+                contact_of(contacts, i),
+                floor_of(floors, i),
+                Push(0.0, 0.0, 0.0),
+                torques[0, i],
+                torques[1, i],
+                DT_S,
+            )
+            set_motion(motions, i, motion)
+            set_contact(contacts, i, contact)
+
+
+@driver
+def together(
+    bodies: np.ndarray,
+    motions: np.ndarray,
+    contacts: np.ndarray,
+    floors: np.ndarray,
+    torques: np.ndarray,
+    slides: np.ndarray,
+) -> None:
+    """The same for as many robots as a table has columns."""
+    t = table(SLIDE_ROWS, SLIDE_COLUMNS)
+    for i in range(SLIDE_COLUMNS):
+        begin_slide(
+            t,
+            i,
+            slides[i],
+            body_of(bodies, i),
+            motion_of(motions, i),
+            contact_of(contacts, i),
+            floor_of(floors, i),
+            Push(0.0, 0.0, 0.0),
+            torques[0, i],
+            torques[1, i],
+            DT_S,
+        )
+    sweep_together(t)
+    for i in range(SLIDE_COLUMNS):
+        if slides[i]:
+            motion, contact = end_slide(t, i, motion_of(motions, i), DT_S)
+            set_motion(motions, i, motion)
+            set_contact(contacts, i, contact)
+
+
+def robots(rng: np.random.Generator) -> np.ndarray:
+    """Some with joint friction, some without, ``(field, robot)``."""
+    kinds = [body(RobotParameters(joint_friction=bool(rng.random() < 0.7))) for _ in range(8)]
+    return np.array(kinds).T.copy()
+
+
+@pytest.mark.parametrize("seed", range(30))
+def test_side_by_side_gives_the_bits_of_one_by_one(seed):
+    rng = np.random.default_rng(seed)
+    bodies = robots(rng)
+    scales = rng.choice([0.0, 1e-3, 0.05, 0.3, 1.0], SLIDE_COLUMNS)
+    motions = np.array([random_start(rng, scale) for scale in scales]).T.copy()
+    stuck = rng.random(SLIDE_COLUMNS) < 0.3
+    motions[Motion._fields.index("s"), stuck] = motions[Motion._fields.index("w"), stuck]
+    contacts = np.zeros((len(Contact._fields), SLIDE_COLUMNS))
+    floors = np.zeros((len(Floor._fields), SLIDE_COLUMNS))
+    floors[:2] = rng.choice([0.0, 40.0, -25.0], (2, SLIDE_COLUMNS))
+    floors[2:5] = rng.choice([1.0, 0.7, 0.1, 0.0], (3, SLIDE_COLUMNS))
+    floors[6] = rng.choice([0.0, 0.0, 0.05], SLIDE_COLUMNS)
+    slides = rng.random(SLIDE_COLUMNS) < rng.choice([0.3, 0.8, 1.0])
+    one, many = (motions.copy(), contacts.copy()), (motions.copy(), contacts.copy())
+    for _ in range(STEPS):
+        torques = rng.uniform(-6e4, 6e4, (2, SLIDE_COLUMNS))
+        alone(bodies, *one, floors, torques, slides)
+        together(bodies, *many, floors, torques, slides)
+        assert np.isfinite(one[0]).all()
+        for got, wanted in zip(many, one, strict=True):
+            assert got.tobytes() == wanted.tobytes()
+    assert (one[0] == motions)[:, ~slides].all()
+    assert (one[0] != motions)[4:11, slides].any(axis=0).all() or not scales[slides].all()

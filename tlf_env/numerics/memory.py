@@ -1,0 +1,94 @@
+"""Memory that begins at a cache line: arrays, and tables of a compiled function's own on the stack."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+from numba import types
+from numba.core import cgutils
+from numba.extending import intrinsic
+
+CACHE_LINE_BYTES = 64  # of all processors that are common
+DOUBLE_BYTES = 8
+
+
+def _array_at(context: Any, builder: Any, array: Any, memory: Any, shape: tuple[int, int]) -> Any:
+    """An array struct of a constant shape over some memory that it does not own."""
+    made = context.make_array(array)(context, builder)
+    context.populate_array(
+        made,
+        data=builder.bitcast(memory, made.data.type),
+        shape=[context.get_constant(types.intp, one) for one in shape],
+        strides=[
+            context.get_constant(types.intp, one) for one in (shape[1] * DOUBLE_BYTES, DOUBLE_BYTES)
+        ],
+        itemsize=context.get_constant(types.intp, DOUBLE_BYTES),
+        meminfo=None,
+    )
+    return made._getvalue()
+
+
+def zeros(shape: tuple[int, ...], dtype: Any = np.float64) -> np.ndarray:
+    """As ``np.zeros``, with the first number at the beginning of a cache line."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    memory = np.zeros(size + CACHE_LINE_BYTES, dtype=np.uint8)
+    first = -memory.ctypes.data % CACHE_LINE_BYTES
+    return memory[first : first + size].view(dtype).reshape(shape)
+
+
+@intrinsic(prefer_literal=True)
+def table(_context: Any, rows: Any, columns: Any) -> Any:
+    """An array ``(rows, columns)`` of floats that lasts as long as the call; its size is known when compiling.
+
+    It begins at a cache line, so that a row of eight is one line: a vector that lies across two lines takes
+    twice as long to load or store. The compiler also knows that no other array overlaps it.
+    """
+    array = types.Array(types.float64, 2, "C")
+    shape = rows.literal_value, columns.literal_value
+
+    def build(context: Any, builder: Any, _signature: Any, _values: Any) -> Any:
+        with builder.goto_entry_block():
+            memory = builder.alloca(ir.ArrayType(ir.DoubleType(), shape[0] * shape[1]))
+            memory.align = CACHE_LINE_BYTES
+        return _array_at(context, builder, array, memory, shape)
+
+    return array(rows, columns), build
+
+
+@intrinsic(prefer_literal=True)
+def shaped(_context: Any, array: Any, rows: Any, columns: Any) -> Any:
+    """The same table of floats ``(rows, columns)``, of a size that is known when compiling; not checked.
+
+    For a function that is called rather than inlined: without it, its loops would not become vectors.
+    """
+    shape = rows.literal_value, columns.literal_value
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        data = context.make_array(array)(context, builder, value=values[0]).data
+        return _array_at(context, builder, signature.return_type, data, shape)
+
+    return array(array, rows, columns), build
+
+
+@intrinsic
+def prefetch(_context: Any, array: Any, _row: Any, _column: Any) -> Any:
+    """Have the cache line of an element of a two-dimensional array brought to the cache, to be read later."""
+    place = types.intp
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        kind = signature.args[0]
+        made = context.make_array(kind)(context, builder, value=values[0])
+        where = cgutils.get_item_pointer(context, builder, kind, made, values[1:])
+        bytes_at = builder.bitcast(where, ir.IntType(8).as_pointer())
+        number = ir.IntType(32)
+        kinds = [bytes_at.type, number, number, number]
+        ask = builder.module.declare_intrinsic(
+            "llvm.prefetch", [bytes_at.type], ir.FunctionType(ir.VoidType(), kinds)
+        )
+        builder.call(ask, [bytes_at, number(0), number(3), number(1)])
+        return context.get_dummy_value()
+
+    return types.none(array, place, place), build
