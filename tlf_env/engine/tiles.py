@@ -82,7 +82,7 @@ from tlf_env.engine.substeps import (
     with_delivered,
     with_grip,
 )
-from tlf_env.numerics.compiled import allocating, block, law, view
+from tlf_env.numerics.compiled import allocating, law, view
 from tlf_env.numerics.memory import prefetch, shaped, table
 from tlf_env.numerics.rows import choosing, replacing
 from tlf_env.onboard.kinds import EKF, EKF_GYRO, EKF_SLIP
@@ -280,7 +280,7 @@ def assign(
         set_order(tile, i, first_times(order, arrays.clock[lane, 0]))
 
 
-@block
+@law
 def change_effects(arrays: Arrays, tile: np.ndarray, count: int, settings: Settings) -> None:
     """Evaluate the channels that may change in every substep."""
     lanes = arrays.states.shape[2]
@@ -293,7 +293,7 @@ def change_effects(arrays: Arrays, tile: np.ndarray, count: int, settings: Setti
         load_effects(tile, flat(arrays.applied), columns_of(tile))
 
 
-@block
+@law
 def delay_torques(torques: np.ndarray, tile: np.ndarray, count: int) -> None:
     """Deliver the torques commanded one dead time ago; ``torques`` is their ring."""
     slots, lanes = torques.shape[1], torques.shape[3]
@@ -314,7 +314,7 @@ def delay_torques(torques: np.ndarray, tile: np.ndarray, count: int) -> None:
         set_traction(tile, i, with_delivered(traction, delivered_l, delivered_r))
 
 
-@block
+@law
 def meet_patches(
     patches: np.ndarray, variants: np.ndarray, lanes: int, tile: np.ndarray, count: int
 ) -> None:
@@ -343,7 +343,7 @@ def differ(tile: np.ndarray, rows: np.ndarray, values: np.ndarray) -> bool:
     return found
 
 
-@block
+@law
 def limit_motors(tile: np.ndarray, count: int) -> None:
     """Deliver what the motors can."""
     for i in range(count):
@@ -354,7 +354,7 @@ def limit_motors(tile: np.ndarray, count: int) -> None:
         set_traction(tile, i, with_delivered(traction, delivered_l, delivered_r))
 
 
-@block
+@law
 def pull(tile: np.ndarray, count: int) -> None:
     """Pushes and slopes; on a slope, the floor carries less."""
     for i in range(count):
@@ -406,7 +406,7 @@ def ask(tile: np.ndarray, substep: int) -> None:
         set_traction(tile, i, undisturbed(commanded_l, commanded_r, effects_of(tile, i)))
 
 
-@block
+@law
 def hand_over(inputs: np.ndarray, lanes: int, tile: np.ndarray, count: int) -> None:
     """Write what a plant in Python needs for the substep."""
     for i in range(count):
@@ -419,7 +419,7 @@ def hand_over(inputs: np.ndarray, lanes: int, tile: np.ndarray, count: int) -> N
         write_push(inputs, robot, lane, push_of(tile, i))
 
 
-@block
+@law
 def slide_alone(tile: np.ndarray, count: int, dt: float) -> None:
     """By sweeps, robot by robot, those whose wheels do not all roll."""
     tile = shaped(tile, TILE_ROWS, WIDTH)
@@ -440,7 +440,7 @@ def slide_alone(tile: np.ndarray, count: int, dt: float) -> None:
             set_impulses(tile, i, impulses)
 
 
-@block
+@law
 def slide_together(tile: np.ndarray, dt: float) -> None:
     """By sweeps, side by side, those whose wheels do not all roll."""
     tile, sweeps = shaped(tile, TILE_ROWS, WIDTH), table(SLIDE_ROWS, SLIDE_COLUMNS)
@@ -565,7 +565,7 @@ def repeat_fixes(tile: np.ndarray, dt: float) -> None:
         set_fix(tile, i, Fix(x=x, y=y, here=0.0, age=age, way_x=0.0, way_y=0.0))
 
 
-@block
+@law
 def deliver_fixes(ring: np.ndarray, tile: np.ndarray, count: int, settings: Settings) -> None:
     """Position fixes that come seldom, late, never or far off; ``ring`` (Fix, slot, column) keeps them."""
     slots = ring.shape[1]
@@ -600,7 +600,7 @@ def deliver_fixes(ring: np.ndarray, tile: np.ndarray, count: int, settings: Sett
         )
 
 
-@block
+@law
 def keep_ways(ring: np.ndarray, tile: np.ndarray, count: int) -> None:
     """Keep the estimators' ways with the fixes that are measured now."""
     slots = ring.shape[1]
