@@ -28,8 +28,8 @@ class Share(NamedTuple):
 # Optimising a driver as a whole takes about half as long as compiling the functions inside it.
 DRIVER_FOR_FUNCTION = 0.5
 # Each for two processes: what most runs need, and everything.
-USUAL = (Share("float32", ("step",), 478), Share("float32", ("start",), 123))
-ALL = (Share("float32", ("step", "start", "speed"), 537), Share("float64", ("step", "start"), 524))
+USUAL = (Share("float32", ("step",), 624), Share("float32", ("start",), 123))
+ALL = (Share("float32", ("step", "start", "speed"), 682), Share("float64", ("step", "start"), 668))
 
 
 def compile_drivers(shares: tuple[Share, ...] = USUAL) -> None:

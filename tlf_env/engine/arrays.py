@@ -60,6 +60,7 @@ FROM_SCENARIO = (
     "sensor_scales",
     "weights",
     "previews",
+    "changing",
 )
 FEW_LANES = 64
 DOUBLES_PER_CACHE_LINE = 8
@@ -141,7 +142,7 @@ class Arrays(NamedTuple):
     previews: np.ndarray  # (preview,) int64, in control steps
     changing: (
         np.ndarray
-    )  # (channel,) int64: places of those that may change in every substep, in some variant
+    )  # (channel,) int64: places of those that may change in a substep, in some variant
 
     def rows(self, name: str) -> np.ndarray:
         """A row of the engine's table by name, ``(field, robot, lane)``; a view."""
