@@ -49,6 +49,7 @@ def test_the_workflow_runs_every_check() -> None:
         "check-pages",
         "check-live",
         "check-paper",
+        "check-audit",
     }
     makefile = (ROOT / "Makefile").read_text(encoding="utf-8")
     assert all(re.search(rf"^{target}:", makefile, re.MULTILINE) for target in targets)
