@@ -258,7 +258,7 @@ def main() -> None:
             [Entry("model", "through the model", BLUE)],
             PICTURE,
             along="windows",
-            values="mean reward of a window, in the model",
+            values="mean reward in the model",
         )
 
 

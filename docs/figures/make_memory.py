@@ -59,7 +59,7 @@ PAGE, RESULTS = DOCS / "learning.md", DOCS / "learning" / "memory.json"
 TRAINED = Path("results/memory")
 PICTURE = RESULTS.with_suffix(".png")
 ARMS = ("plain", "history", "truth")
-DRAWN = (
+LINES = (
     Entry("plain", "without", GREY, "-"),
     Entry("history", "history", BLUE, "--"),
     Entry("truth", "truth", ORANGE, "-."),
@@ -450,7 +450,7 @@ def main() -> None:
     if "courses" in kept:
         draw_courses(
             kept["courses"],
-            DRAWN,
+            LINES,
             PICTURE,
             along="robot steps, millions",
             values="mean reward of a rollout",
