@@ -1,6 +1,6 @@
 """Rollouts of one process and of the workers of a Ray cluster: the table of ``docs/scale.md``.
 
-``python docs/figures/make_scale.py`` needs the extras ``train`` and ``ray`` and takes about three minutes.
+``python docs/figures/make_scale.py`` needs the extras ``train`` and ``ray`` and takes about five minutes.
 Ray runs on this machine. All ways take turns; a round of each is :data:`STEPS` control steps with actions of a
 small deviation, as a learner's are, and times are medians of the rounds by the clock.
 """
@@ -22,7 +22,7 @@ from baselines.ray_sb3 import RayFormationVecEnv
 from baselines.sb3 import FormationVecEnv
 
 PAGE = DOCS / "scale.md"
-FORMATIONS = (64, 512, 2048)
+FORMATIONS = (64, 512)
 STEPS, ROUNDS, DEVIATION = 60, 7, 0.1
 SCENARIO: dict[str, Any] = {"action": "tracking_twist", "infos": False}
 WAYS: dict[str, Callable[[int], Any]] = {
