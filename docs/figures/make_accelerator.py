@@ -42,9 +42,12 @@ def use_device() -> None:
     dispatcher.get_current_device = Device
     compiled.law = compiled.block = compiled.allocating = compiled.view = on_device
     compiled.driver = lambda function: function
+    of_processor = numba.extending.intrinsic
     numba.extending.intrinsic = extending.intrinsic
-    from tlf_env.engine import sensors
     from tlf_env.numerics import angles, trig
+
+    numba.extending.intrinsic = of_processor  # no kernel uses those of the other modules
+    from tlf_env.engine import sensors
 
     rounding = types.ModuleType("rounding")  # NumPy's functions of these names are not there
     rounding.rint, rounding.floor, rounding.sqrt = libdevice.rint, libdevice.floor, libdevice.sqrt
@@ -56,7 +59,13 @@ def kernels() -> dict[str, tuple[Callable[..., None], Any]]:
     """The kernels by name, with their types; row r of robot i is ``robots[r, i]``, as in a tile."""
     from tlf_env.engine import tiles
     from tlf_env.engine.layout import Draw, Reading, WheelPair, YawRate
-    from tlf_env.engine.sensors import measured_fix, sense_robot
+    from tlf_env.engine.sensors import (
+        account_robot,
+        correct_robot,
+        measured_fix,
+        odometry_of,
+        predict_robot,
+    )
     from tlf_env.engine.substeps import commanded_torques, floor_under, trace_drive, undisturbed
     from tlf_env.onboard.kinds import EKF_SLIP
     from tlf_env.physics.vehicle import Push, advance_pose, roll, slide
@@ -72,41 +81,29 @@ def kernels() -> dict[str, tuple[Callable[..., None], Any]]:
     slip_of, set_slip = tiles.slip_of, tiles.set_slip
     trace_of, set_trace = tiles.trace_of, tiles.set_trace
 
-    def rolling(robots, dt):  # type: ignore[no-untyped-def]
-        i = cuda.grid(1)
-        if i < robots.shape[1]:
-            body, traction = body_of(robots, i), traction_of(robots, i)
-            _, motion, contact = roll(
-                body,
-                motion_of(robots, i),
-                contact_of(robots, i),
-                floor_under(body, effects_of(robots, i), traction),
-                push_of(robots, i),
-                traction.delivered_l,
-                traction.delivered_r,
-                dt,
-            )
-            set_motion(robots, i, advance_pose(motion, dt))
-            set_contact(robots, i, contact)
+    def plant(law: Any) -> Callable[[Any, float], None]:
+        """A substep of the plant by one of its two laws."""
 
-    def sliding(robots, dt):  # type: ignore[no-untyped-def]
-        i = cuda.grid(1)
-        if i < robots.shape[1]:
-            body, traction = body_of(robots, i), traction_of(robots, i)
-            motion, contact = slide(
-                body,
-                motion_of(robots, i),
-                contact_of(robots, i),
-                floor_under(body, effects_of(robots, i), traction),
-                push_of(robots, i),
-                traction.delivered_l,
-                traction.delivered_r,
-                dt,
-            )
-            set_motion(robots, i, advance_pose(motion, dt))
-            set_contact(robots, i, contact)
+        def kernel(robots: Any, dt: float) -> None:
+            i = cuda.grid(1)
+            if i < robots.shape[1]:
+                body, traction = body_of(robots, i), traction_of(robots, i)
+                found = law(
+                    body,
+                    motion_of(robots, i),
+                    contact_of(robots, i),
+                    floor_under(body, effects_of(robots, i), traction),
+                    push_of(robots, i),
+                    traction.delivered_l,
+                    traction.delivered_r,
+                    dt,
+                )
+                set_motion(robots, i, advance_pose(found[-2], dt))
+                set_contact(robots, i, found[-1])
 
-    def step(robots, draws, substeps, dt):  # type: ignore[no-untyped-def]
+        return kernel
+
+    def step(robots: Any, draws: Any, substeps: int, dt: float) -> None:
         i = cuda.grid(1)
         if i >= robots.shape[1]:
             return
@@ -132,23 +129,38 @@ def kernels() -> dict[str, tuple[Callable[..., None], Any]]:
             trace = trace_drive(trace, body.torque_limit, traction, moved, contact, dt)
             motion = advance_pose(moved, dt)
             draw = Draw(draws[0, i], i, draws[1, i], draws[2, i] + substep + 1)
-            sensors, estimate, slip, trace, _ = sense_robot(
+            reading = Reading(motion.angle_l, motion.angle_r)
+            fix = measured_fix(body, motion, effects, draw)
+            increments = odometry_of(body, belief, reading, sensors)
+            sensors, estimate, slip = predict_robot(
                 body,
                 belief,
                 ekf,
                 slip_ekf,
                 motion,
-                Reading(motion.angle_l, motion.angle_r),
-                measured_fix(body, motion, effects, draw),
+                increments,
+                sensors,
+                estimate,
+                slip,
+                order,
+                substep,
+                EKF_SLIP,
+                dt,
+            )
+            estimate, slip, innovation = correct_robot(
+                ekf, slip_ekf, fix, sensors, estimate, slip, EKF_SLIP
+            )
+            sensors, trace, _ = account_robot(
+                reading,
+                fix,
                 YawRate(motion.w),
                 WheelPair(left, right),
+                increments,
                 sensors,
                 estimate,
                 slip,
                 trace,
-                order,
-                substep,
-                EKF_SLIP,
+                innovation,
                 dt,
             )
         set_motion(robots, i, motion)
@@ -162,8 +174,8 @@ def kernels() -> dict[str, tuple[Callable[..., None], Any]]:
     of_plant = (numba.float64[:, ::1], numba.float64)
     of_step = (numba.float64[:, ::1], numba.int64[:, ::1], numba.int64, numba.float64)
     return {
-        "plant, all wheels roll": (rolling, of_plant),
-        "plant, sweeps": (sliding, of_plant),
+        "plant, all wheels roll": (plant(roll), of_plant),
+        "plant, sweeps": (plant(slide), of_plant),
         "control step: wheel loops, plant, noise, `ekf-slip`": (step, of_step),
     }
 

@@ -91,8 +91,8 @@ def packed(values: V) -> V:
 def _words(value: Any, kind: types.Type) -> Iterator[int]:
     """A value as Numba lays it out, each number in a word of 64 bits."""
     if isinstance(kind, types.Array):
-        nobody = (0, 0)  # no owner that compiled code would count references to
-        yield from (*nobody, value.size, value.itemsize, value.ctypes.data)
+        no_owner = (0, 0)  # compiled code counts no references to this memory
+        yield from (*no_owner, value.size, value.itemsize, value.ctypes.data)
         yield from (*value.shape, *value.strides)
     elif isinstance(kind, BaseTuple):
         for one, part in zip(value, kind, strict=True):
