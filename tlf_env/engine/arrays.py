@@ -114,8 +114,9 @@ class Arrays(NamedTuple):
         np.ndarray
     )  # (Way, slot, robot, lane): ring over the windows of smoothed broadcasts, or none
     references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
-    paths: np.ndarray  # (x y, slot, robot, lane): true positions, ring over one gap and a window
-    longest: np.ndarray  # (robot, lane): longest distance within a control step so far, mm
+    paths: (
+        np.ndarray
+    )  # (x y way, slot, robot, lane): true positions and ways so far, ring over one gap and a window
     # time and random numbers
     clock: np.ndarray  # (lane, 4) int64: substeps, control steps, episode, control step of its end
     seeds: np.ndarray  # (lane,) int64
@@ -323,8 +324,7 @@ def make_arrays(
         messages=zeros((len(Message._fields), ring, robots, columns)),
         ways=zeros((len(Way._fields), smoothing_slots(scenario, old), robots, columns)),
         references=zeros((len(Reference._fields), lookahead + 1, robots, columns)),
-        paths=zeros((2, gap + window + 1, robots, columns)),
-        longest=zeros((robots, columns)),
+        paths=zeros((3, gap + window + 1, robots, columns)),
         clock=np.zeros((lanes, 4), dtype=np.int64),
         seeds=np.zeros(lanes, dtype=np.int64),
         actions=np.zeros((lanes, robots, ACTION_SIZE)),

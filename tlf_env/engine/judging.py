@@ -190,20 +190,19 @@ def wanted_of_formation(
 
 @law
 def record_truth(arrays: Arrays, lane: int, robot: int, step: int) -> None:
-    """Put a robot's true position into the ring of paths."""
+    """Put a robot's true position, and its way so far, into the ring of paths."""
     slot = step % arrays.paths.shape[1]
     x, y = axle_midpoint(
         read_motion(arrays.states, robot, lane), arrays.constants[BODY_D, robot, lane]
     )
     arrays.paths[0, slot, robot, lane], arrays.paths[1, slot, robot, lane] = x, y
-    if step == 0:
-        arrays.longest[robot, lane] = 0.0
-    else:
-        before = (step - 1) % arrays.paths.shape[1]
-        way = distance(
+    way = 0.0
+    if step > 0:
+        before = slot - 1 if slot > 0 else arrays.paths.shape[1] - 1
+        way = arrays.paths[2, before, robot, lane] + distance(
             x, y, arrays.paths[0, before, robot, lane], arrays.paths[1, before, robot, lane]
         )
-        arrays.longest[robot, lane] = max(arrays.longest[robot, lane], way)
+    arrays.paths[2, slot, robot, lane] = way
 
 
 @law
@@ -227,7 +226,6 @@ def judge_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Sett
             settings.gap,
             settings.window,
             settings.period,
-            arrays.longest[robot - 1, lane],
         )
     to_Nmm = 1.0 / (settings.substeps * MILLINEWTON_PER_NEWTON)
     info = Info(

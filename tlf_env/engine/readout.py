@@ -89,7 +89,7 @@ def reference(arrays: Arrays) -> Any:
 
 def true_positions(arrays: Arrays, step: int) -> np.ndarray:
     """True position of c at a control step of the last gap, ``(2, formation, robot)``, mm."""
-    return arrays.slot(arrays.paths, step).transpose(0, 2, 1)
+    return arrays.slot(arrays.paths, step)[:2].transpose(0, 2, 1)
 
 
 def state(arrays: Arrays) -> Any:
