@@ -17,7 +17,7 @@ from tlf_env.engine.batch import BatchPlant, Source, checked_count
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.info import EndReason, InfoChoice, chosen_keys
+from tlf_env.task.info import TIME_GAP_KEY, EndReason, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import learners_action
 from tlf_env.task.start import Start, joined, same_start, start_options
@@ -109,6 +109,9 @@ class FormationVecEnv(VecEnv):
             )
             for task, share in zip(tasks, shares, strict=True)
         ]
+        if TIME_GAP_KEY not in self._info_keys:
+            for plant in self.plants:
+                plant.compute_time_gap_of([])
         self._spaces_agree()
         self._rows = [plant.formations * plant.scenario.robot_count for plant in self.plants]
         self._ends = np.cumsum([0, *self._rows])

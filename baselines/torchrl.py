@@ -23,7 +23,7 @@ from tlf_env.engine.batch import BatchPlant, Source, checked_count
 from tlf_env.engine.formation import STATE_SCALES
 from tlf_env.numerics.philox import MAX_SEED
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.info import EndReason, InfoChoice, chosen_keys
+from tlf_env.task.info import TIME_GAP_KEY, EndReason, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import learners_action
 
@@ -86,6 +86,8 @@ class FormationBatchEnv(EnvBase):
         self.plant = BatchPlant(
             scenario, formations, threads=threads, staggered=staggered, **overrides
         )
+        if TIME_GAP_KEY not in self._info_keys:
+            self.plant.compute_time_gap_of([])
         self._first_seed = seed
         self._make_specs()
 

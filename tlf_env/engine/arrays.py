@@ -49,7 +49,8 @@ from tlf_env.task.observation import sensor_entries, tracking_entries
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.scenario import Scenario
 
-# Arrays that follow from the scenario alone, or (``tables``) from it and the phase of a start.
+# Arrays that follow from the scenario alone, or (``tables``) from it and the phase of a start, or (``timed``)
+# from what is asked for.
 FROM_SCENARIO = (
     "signals",
     "patches",
@@ -61,6 +62,7 @@ FROM_SCENARIO = (
     "weights",
     "previews",
     "changing",
+    "timed",
 )
 FEW_LANES = 64
 DOUBLES_PER_CACHE_LINE = 8
@@ -144,6 +146,7 @@ class Arrays(NamedTuple):
     changing: (
         np.ndarray
     )  # (channel,) int64: places of those that may change in a substep, in some variant
+    timed: np.ndarray  # (robot,) bool: whose time gap error is computed
 
     def rows(self, name: str) -> np.ndarray:
         """A row of the engine's table by name, ``(field, robot, lane)``; a view."""
@@ -348,4 +351,5 @@ def make_arrays(
         weights=np.array([scenario.reward[name] for name in RewardTerms._fields]),
         previews=np.array(scenario.preview_steps, dtype=np.int64),
         changing=changing_channels([one.disturbance for one in scenarios], scenario.adversary),
+        timed=np.ones(robots, dtype=np.bool_),
     )

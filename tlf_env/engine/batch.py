@@ -32,6 +32,7 @@ from tlf_env.numerics.compiled import compile_for
 from tlf_env.numerics.philox import MAX_SEED, checked_seed
 from tlf_env.numerics.pointers import packed
 from tlf_env.onboard.parts import real_numbers
+from tlf_env.task.info import TIME_GAP_KEY
 from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.start import Start, start_options
 from tlf_env.task.warn import warn_of
@@ -291,6 +292,26 @@ class BatchPlant:
         if ended.any():
             self.reset(mask=ended)
         return ended
+
+    def compute_time_gap_of(self, robots: Sequence[int]) -> None:
+        """Compute ``time_gap_error_s`` of these robots only; that of the others is NaN from now on.
+
+        It is the one entry of the infos that takes long: the search of a point on the predecessor's path.
+
+        Raises
+        ------
+        ValueError
+            for a number that is not a robot's.
+        """
+        unknown = sorted(set(robots) - set(range(self.scenario.robot_count)))
+        if unknown:
+            raise ValueError(
+                f"robots {unknown} must be at least 0 and less than {self.scenario.robot_count}"
+            )
+        timed = self.arrays.timed
+        timed[:] = False
+        timed[list(robots)] = True
+        self.info(TIME_GAP_KEY)[:, ~timed] = np.nan
 
     def step(self, actions: np.ndarray, excerpt: Excerpt | None = None) -> None:
         """Advance all formations by one control period.

@@ -216,7 +216,9 @@ def judge_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Sett
     error = distance(x, y, reference.x, reference.y)
     wanted_x, wanted_y = wanted_of_formation(arrays, lane, robot, step, settings.gap)
     late = 0.0
-    if robot > 0:
+    if not arrays.timed[robot]:
+        late = math.nan
+    elif robot > 0:
         path = arrays.paths[:, :, robot - 1, lane]
         late = time_gap_error(
             x,

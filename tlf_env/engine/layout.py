@@ -222,9 +222,9 @@ ROWS = (
     Row("wheel_loop", WheelLoopRow, Kind.CONSTANT),
     Row("ekf", Ekf, Kind.CONSTANT),
     Row("slip_ekf", SlipEkf, Kind.CONSTANT),
-    Row("gyro_ekf", GyroEkf, Kind.CONSTANT),
     Row("belief", Belief, Kind.CONSTANT),
     Row("speed_observer", SpeedObserverRow, Kind.CONSTANT),
+    Row("gyro_ekf", GyroEkf, Kind.CONSTANT),  # the last of its kind: see WITHOUT_GYRO
     Row("motion", Motion, Kind.STATE),
     Row("contact", Contact, Kind.STATE),
     Row("loop_state", WheelLoopState, Kind.STATE),
@@ -233,8 +233,8 @@ ROWS = (
     Row("commanded", WheelPair, Kind.STATE),  # torques within the motors' limits
     Row("estimate", Estimate, Kind.STATE),
     Row("slip", SlipEstimate, Kind.STATE),
-    Row("gyro", GyroEstimate, Kind.STATE),
     Row("trace", Trace, Kind.STATE),
+    Row("gyro", GyroEstimate, Kind.STATE),  # the last of its kind
     Row("wanted", WheelPair, Kind.CONTROL),  # wheel speeds or torques that the action asks for
     Row("wanted_before", WheelPair, Kind.CONTROL),  # those of the step before
     Row("command", WheelPair, Kind.CONTROL),  # ``wanted``, or torques of a wheel loop outside
@@ -282,6 +282,8 @@ TILE_ROWS = fields_of(Kind.CONSTANT, Kind.STATE, Kind.SCRATCH)
 _IN_ARRAYS = _first_fields(Kind.CONSTANT) | _first_fields(Kind.STATE, Kind.CONTROL)
 _IN_TILES = _first_fields(Kind.CONSTANT, Kind.STATE, Kind.SCRATCH)
 CONSTANTS_IN_TILE, STATES_IN_TILE = 0, CONSTANT_FIELDS
+# How many fields of the constants and of the states are read without the filter that uses the gyro.
+WITHOUT_GYRO = _IN_ARRAYS["gyro_ekf"], _IN_ARRAYS["gyro"]
 EFFECTS_IN_TILE = _IN_TILES["effects"]
 
 

@@ -34,7 +34,7 @@ Layout = Mapping[
 
 
 # Arrays that may hold NaN: no value was set there.
-UNDEFINED = ("imposed",)
+UNDEFINED = ("imposed", "infos")  # NaN: not imposed, not computed
 
 
 class Snapshot:

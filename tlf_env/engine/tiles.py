@@ -35,6 +35,7 @@ from tlf_env.engine.layout import (
     STATE_FIELDS,
     STATES_IN_TILE,
     TILE_ROWS,
+    WITHOUT_GYRO,
     Draw,
     Fix,
     Innovation,
@@ -220,15 +221,23 @@ def columns_after(lanes: np.ndarray, lanes_in_all: int, item: int, items: int) -
 
 @law
 def ask_for(
-    constants: np.ndarray, states: np.ndarray, columns: tuple[int, int], row: int, rows: int
+    constants: np.ndarray,
+    states: np.ndarray,
+    used: tuple[int, int],
+    columns: tuple[int, int],
+    row: int,
+    rows: int,
 ) -> None:
-    """Have so many rows from ``row`` on, of constants and then states, brought to the cache for later."""
-    for k in range(row, min(row + rows, constants.shape[0] + STATE_FIELDS)):
+    """Have so many rows from ``row`` on, of constants and then states, brought to the cache for later.
+
+    ``used`` is how many of both are used.
+    """
+    for k in range(row, min(row + rows, used[0] + used[1])):
         for column in columns:
-            if k < constants.shape[0]:
+            if k < used[0]:
                 prefetch(constants, k, column)
             else:
-                prefetch(states, k - constants.shape[0], column)
+                prefetch(states, k - used[0], column)
 
 
 @law
@@ -795,12 +804,15 @@ def advance_in(
     # All samples of a control step are kept for those who read them, otherwise only the last.
     keeps = settings.has_parts or arrays.sensor_observations.shape[2] > 0
     columns = columns_of(tile)
-    items, ahead = lanes.shape[0] * robots, constants.shape[0] + STATE_FIELDS
+    used = WITHOUT_GYRO
+    if settings.estimator == EKF_GYRO:
+        used = constants.shape[0], STATE_FIELDS
+    items, ahead = lanes.shape[0] * robots, used[0] + used[1]
     for item in range(0, items, WIDTH):
         count = min(WIDTH, items - item)
         assign(arrays, tile, lanes, item, count, settings)
-        load(tile, CONSTANTS_IN_TILE, constants, constants.shape[0], columns)
-        load(tile, STATES_IN_TILE, states, STATE_FIELDS, columns)
+        load(tile, CONSTANTS_IN_TILE, constants, used[0], columns)
+        load(tile, STATES_IN_TILE, states, used[1], columns)
         load_effects(tile, applied, columns)
         needs = needs_of(tile)
         if needs.fixes or settings.changing:  # the last fix of every robot
@@ -811,7 +823,7 @@ def advance_in(
         for substep in range(begin, end):
             if end - begin > 1:
                 share = ahead // (end - begin) + 1
-                ask_for(constants, states, next_columns, (substep - begin) * share, share)
+                ask_for(constants, states, used, next_columns, (substep - begin) * share, share)
             if actuates:
                 if settings.changing:
                     change_effects(arrays, tile, count, settings)
@@ -853,7 +865,7 @@ def advance_in(
                     for f in range(SAMPLE_FIELDS):
                         for i in range(count):
                             samples[substep, f, columns[i]] = tile[SAMPLE + f, i]
-        store(tile, STATES_IN_TILE, states, STATE_FIELDS, columns, count)
+        store(tile, STATES_IN_TILE, states, used[1], columns, count)
     if senses:
         for i in range(lanes.shape[0]):
             arrays.clock[lanes[i], 0] += end - begin

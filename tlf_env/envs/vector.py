@@ -21,7 +21,7 @@ from tlf_env.engine.snapshot import Snapshot, checked_generator, checked_snapsho
 from tlf_env.envs.single import BY_REFERENCE, HasSpec
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE
-from tlf_env.task.info import INFO_KEYS, InfoChoice, chosen_keys
+from tlf_env.task.info import INFO_KEYS, TIME_GAP_KEY, InfoChoice, chosen_keys
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario, learners_action, load_scenario
 from tlf_env.task.start import start_options
@@ -150,6 +150,7 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             raise ValueError(f"autoreset_mode {autoreset_mode!r} is not one of {modes}") from error
         self.learner = learner
         self._robot = agents.index(learner)
+        self.plant.compute_time_gap_of([self._robot] if TIME_GAP_KEY in self._info_keys else [])
         others_of = [i for i in range(robots) if i != self._robot]
         self.plant.arrays.kinds[others_of] = self.scenario.reference_kind
         self.num_envs = self.plant.formations

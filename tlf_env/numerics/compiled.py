@@ -68,6 +68,7 @@ F = TypeVar("F", bound=Callable[..., Any])
 PACKAGE = Path(__file__).resolve().parent.parent
 DIGEST_BYTES = hashlib.sha256().digest_size
 FEW = (100_000, 50, 1000)  # thresholds of Python's garbage collector while a driver is compiled
+LEVEL = 2  # of LLVM's passes over a driver: those of level 3 take longer, and drivers are not faster
 ROOMS_WITH_LAWS = ("numerics", "physics", "onboard", "disturbances", "task", "engine")
 
 
@@ -367,20 +368,26 @@ class _LinkedCompiler(CompilerBase):
 
 
 @contextmanager
-def _few_collections() -> Iterator[None]:
-    """Look less often for garbage: Numba holds millions of objects, and next to none is garbage."""
+def _quickly() -> Iterator[None]:
+    """Look less often for garbage: Numba holds millions of objects, and next to none is garbage.
+
+    And leave out the passes of LLVM that gain nothing here.
+    """
+    config: Any = numba.config
     with global_compiler_lock:  # so that no other thread restores what is set here
-        before = gc.get_threshold()
+        threshold, level = gc.get_threshold(), config.OPT
         gc.set_threshold(*FEW)
+        config.OPT = type(level)(min(level, LEVEL))
         try:
             yield
         finally:
-            gc.set_threshold(*before)
+            config.OPT = level
+            gc.set_threshold(*threshold)
 
 
 class _Driver(CPUDispatcher):
     def compile(self, sig: Any) -> Any:
-        with _few_collections():
+        with _quickly():
             try:
                 return super().compile(sig)
             finally:

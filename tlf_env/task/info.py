@@ -35,6 +35,9 @@ class Info(NamedTuple):
     clipped: float
 
 
+TIME_GAP_KEY = "time_gap_error_s"
+
+
 class EndReason(IntEnum):
     """Why a robot's episode ended in a step: the values of ``info["end"]`` and ``BatchPlant.ends``."""
 

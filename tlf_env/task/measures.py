@@ -41,7 +41,7 @@ def steps_within(ways: np.ndarray, at: int, most: int, direction: int, room: flo
     number is not always the largest one.
     """
     slots = ways.shape[0]
-    steps = most
+    steps = most if room > 0.0 else 0
     while steps > 0:
         there = at + direction * steps
         there += slots if there < 0 else (-slots if there >= slots else 0)
