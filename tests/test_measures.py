@@ -1,4 +1,4 @@
-"""The time gap error: its search leaves out most of the path, and must find the same as a search of all of it."""
+"""The search of the time gap leaves out most of the path, and must find the same as a search of all of it."""
 
 import math
 

@@ -68,7 +68,9 @@ F = TypeVar("F", bound=Callable[..., Any])
 PACKAGE = Path(__file__).resolve().parent.parent
 DIGEST_BYTES = hashlib.sha256().digest_size
 FEW = (100_000, 50, 1000)  # thresholds of Python's garbage collector while a driver is compiled
-LEVEL = 2  # of LLVM's passes over a driver: those of level 3 take longer, and drivers are not faster
+LEVEL = (
+    2  # of LLVM's passes over a driver: those of level 3 take longer, and drivers are not faster
+)
 ROOMS_WITH_LAWS = ("numerics", "physics", "onboard", "disturbances", "task", "engine")
 
 

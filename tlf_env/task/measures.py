@@ -10,7 +10,9 @@ from tlf_env.numerics.compiled import law
 
 TIME_GAP_WINDOW_S = 2.0
 ROUNDING_MM = 1e-6  # above the rounding error of a distance, and of a way
-STEPS_TO_TRY = 8  # steps to leave out are tried less by this share of them, until they are few enough
+STEPS_TO_TRY = (
+    8  # steps to leave out are tried less by this share of them, until they are few enough
+)
 FEW_SEGMENTS = 8  # so many are looked at one by one
 
 
