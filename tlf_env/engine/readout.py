@@ -66,17 +66,22 @@ def info_rows(
 
     Of the channels only those at the given places.
     """
+    none = not isinstance(channels, slice) and len(channels) == 0
+    infos = arrays.infos[lane].tolist()
     rows = zip(
-        arrays.infos[lane].tolist(),
+        infos,
         arrays.terms[lane].tolist(),
-        arrays.applied[channels, :, lane].T.tolist(),
+        [()] * len(infos) if none else arrays.applied[channels, :, lane].T.tolist(),
         arrays.lost[lane].tolist(),
         arrays.touched[lane].tolist(),
         arrays.touched_by[lane].tolist(),
         arrays.ends[lane].tolist(),
         strict=True,
     )
-    return [(*info, *terms, *applied, *flags) for info, terms, applied, *flags in rows]
+    return [
+        (*info, *terms, *applied, lost, touched, touched_by, end)
+        for info, terms, applied, lost, touched, touched_by, end in rows
+    ]
 
 
 def reference(arrays: Arrays) -> Any:

@@ -403,8 +403,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             for agent, first, row in zip(
                 self.possible_agents, self._first_infos, changed, strict=True
             ):
-                named[agent] = first.copy()
-                named[agent].update(zip(self._varying_keys, row, strict=True))
+                named[agent] = info = first.copy()
+                info.update(zip(self._varying_keys, row, strict=True))
             return named
         rows: Sequence[Sequence[float]] = info_rows(arrays)
         if len(keys) < len(INFO_KEYS):
