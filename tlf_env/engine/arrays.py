@@ -116,7 +116,9 @@ class Arrays(NamedTuple):
         np.ndarray
     )  # (Way, slot, robot, lane): ring over the windows of smoothed broadcasts, or none
     references: np.ndarray  # (Reference, slot, robot, lane): ring over the longest preview
-    paths: np.ndarray  # (x y way, slot, robot, lane): true positions, way so far; one gap and a window
+    paths: (
+        np.ndarray
+    )  # (x y way, slot, robot, lane): true positions, way so far; one gap and a window
     # time and random numbers
     clock: np.ndarray  # (lane, 4) int64: substeps, control steps, episode, control step of its end
     seeds: np.ndarray  # (lane,) int64

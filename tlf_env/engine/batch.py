@@ -43,6 +43,10 @@ KIND = "BatchPlant"
 MAY_DIFFER = ("name", "robots", "robot", "wheel_loop", "ekf", "ekf_slip", "ekf_gyro", "disturbance")
 
 
+DOUBLE = "double"
+PRECISIONS: dict[str, type[np.floating[Any]]] = {DOUBLE: np.float64, "single": np.float32}
+
+
 class BatchPlant:
     """Formations that are simulated side by side.
 
@@ -68,6 +72,10 @@ class BatchPlant:
         Whether a reset of all formations spreads the ends of their episodes: that of formation k ends
         after (k + 1)/formations of the horizon, the later ones at the horizon. For learners: otherwise
         all formations are at the same time of their episodes in each rollout.
+    precision
+        Of the numbers in the substeps: ``"double"``, or ``"single"``, which is faster. Between control steps
+        all numbers are doubles, and sliding wheels are always computed in double precision. For training:
+        results in single precision are not those of other plants, bit for bit.
     **overrides
         Fields of all scenarios; ``disturbance_level`` too.
 
@@ -88,8 +96,12 @@ class BatchPlant:
         threads: int | None = 1,
         mixture: bool | Sequence[float] = False,
         staggered: bool = False,
+        precision: str = DOUBLE,
         **overrides: Any,
     ) -> None:
+        if precision not in PRECISIONS:
+            raise ValueError(f"precision {shown(precision)} is not one of {', '.join(PRECISIONS)}")
+        self.precision = precision
         if not isinstance(scenario, Sequence) or isinstance(scenario, str):
             scenario = [scenario]
         overrides, base = separate_base(overrides)
@@ -106,7 +118,9 @@ class BatchPlant:
         self._base = make_base(self.scenario, base)
         self._variants = make_variants(self.scenarios, _shares(mixture, len(self.scenarios)))
         each = [make_settings(one) for one in self.scenarios]
-        self._settings = each[0]._replace(changing=any(one.changing for one in each))
+        self._settings = each[0]._replace(
+            changing=any(one.changing for one in each), number=PRECISIONS[precision](1.0)
+        )
         self._packed = packed(self._settings)
         self._packed_arrays, self._packed_of = packed(self.arrays), self.arrays
         self._seeded = np.zeros(self.formations, dtype=np.bool_)
@@ -399,6 +413,7 @@ class BatchPlant:
             "scenarios": [scenario_facts(one) for one in self.scenarios],
             "mixture": bool(len(self._variants.mixture)),
             "staggered": self._first_ends is not None,
+            "precision": self.precision,
         }
 
     def set_state(self, state: Snapshot) -> None:

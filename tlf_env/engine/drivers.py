@@ -404,14 +404,14 @@ def whole_step(arrays: Arrays, left: np.ndarray, out: Excerpt, settings: Setting
                 else:
                     apart_lanes[apart], apart = lane, apart + 1
             lanes = apart_lanes[:apart]
-            advance(arrays, lanes, 0, settings.substeps, True, True, settings)
+            advance(settings.number, arrays, lanes, 0, settings.substeps, True, True, settings)
             if settings.kinematic:
                 mark_all_touched(arrays, lanes)
             # Robots pass through each other here. While they are close, each substep asks which
             # outlines meet, so that the first touch is marked where a plant with contact marks it.
             lanes = close_lanes[:close]
             for substep in range(settings.substeps if close > 0 else 0):
-                advance(arrays, lanes, substep, substep + 1, True, True, settings)
+                advance(settings.number, arrays, lanes, substep, substep + 1, True, True, settings)
                 mark_all_touched(arrays, lanes)
             transmit_all(arrays, begin, end, arrays.states.shape[1], settings)
             look_all(arrays, begin, end, settings)
@@ -445,7 +445,16 @@ def control_step(
     if part == WHOLE:
         return whole_step(arrays, lanes, out, settings)
     if part in (ACTUATE, SENSE):
-        advance(arrays, lanes, number, number + 1, part == ACTUATE, part == SENSE, settings)
+        advance(
+            settings.number,
+            arrays,
+            lanes,
+            number,
+            number + 1,
+            part == ACTUATE,
+            part == SENSE,
+            settings,
+        )
         if part == SENSE and settings.round_outlines:
             mark_all_touched(arrays, lanes)
         return DONE

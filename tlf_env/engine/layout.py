@@ -207,6 +207,7 @@ class Kind(Enum):
     STATE = "state"  # changes in every substep; zero when an episode starts
     CONTROL = "control"  # changes once per control step, so it is not in tiles; zero when an episode starts
     SCRATCH = "scratch"  # of one substep or one control step; in tiles only
+    WHOLE = "whole"  # the same, whole numbers, in a table of their own beside the tile
 
 
 class Row(NamedTuple):
@@ -255,9 +256,9 @@ ROWS = (
     Row("innovation", Innovation, Kind.SCRATCH),
     Row("moved", Motion, Kind.SCRATCH),  # as the plant leaves it, before the pose is advanced
     Row("impulses", Contact, Kind.SCRATCH),
-    Row("draw", Draw, Kind.SCRATCH),
     Row("rolls", Rolls, Kind.SCRATCH),
-    Row("column", Column, Kind.SCRATCH),
+    Row("draw", Draw, Kind.WHOLE),
+    Row("column", Column, Kind.WHOLE),
 )
 BY_NAME = {row.name: row for row in ROWS}
 
@@ -279,8 +280,9 @@ def _first_fields(*kinds: Kind) -> dict[str, int]:
 CONSTANT_FIELDS = fields_of(Kind.CONSTANT)
 STATE_FIELDS = fields_of(Kind.STATE)  # those of ``Arrays.states`` that are copied into tiles
 TILE_ROWS = fields_of(Kind.CONSTANT, Kind.STATE, Kind.SCRATCH)
+WHOLE_ROWS = fields_of(Kind.WHOLE)
 _IN_ARRAYS = _first_fields(Kind.CONSTANT) | _first_fields(Kind.STATE, Kind.CONTROL)
-_IN_TILES = _first_fields(Kind.CONSTANT, Kind.STATE, Kind.SCRATCH)
+_IN_TILES = _first_fields(Kind.CONSTANT, Kind.STATE, Kind.SCRATCH) | _first_fields(Kind.WHOLE)
 CONSTANTS_IN_TILE, STATES_IN_TILE = 0, CONSTANT_FIELDS
 # How many fields of the constants and of the states are read without the filter that uses the gyro.
 WITHOUT_GYRO = _IN_ARRAYS["gyro_ekf"], _IN_ARRAYS["gyro"]
@@ -293,7 +295,7 @@ def in_array(name: str, field: str | None = None) -> int:
 
 
 def in_tile(name: str, field: str | None = None) -> int:
-    """Place of a row, or of one of its fields, in a tile."""
+    """Place of a row, or of one of its fields, in a tile, or in the table of whole numbers beside it."""
     return _IN_TILES[name] + _place(name, field)
 
 

@@ -30,6 +30,7 @@ from tlf_env.engine.layout import (
 )
 from tlf_env.engine.substeps import wanted
 from tlf_env.numerics.compiled import law
+from tlf_env.numerics.memory import like
 from tlf_env.numerics.philox import normal_pair, unit, words
 from tlf_env.numerics.rows import replacing
 from tlf_env.onboard.calibration import Belief, believed_odometry
@@ -97,7 +98,7 @@ with_sensor_sums = replacing(
 def disturbed_reading(angle: float, noise: float, effects: Effects) -> float:
     """An encoder's reading (rad) with noise (standard normal) and resolution."""
     if effects.encoder_noise_std_rad > 0.0:
-        angle += effects.encoder_noise_std_rad * noise
+        angle += effects.encoder_noise_std_rad * like(noise, angle)
     if effects.encoder_quantum_rad > 0.0:
         angle = effects.encoder_quantum_rad * np.floor(angle / effects.encoder_quantum_rad)
     return angle
@@ -119,7 +120,7 @@ def gyro_reading(motion: Motion, effects: Effects, draw: Draw, dt: float) -> flo
     reading = effects.gyro_scale * motion.w + effects.gyro_bias_rad_s
     if effects.gyro_noise_rad_s_sqrt_hz > 0.0:
         noise, _ = normal_pair(draw.seed, GYRO_NOISE, draw.robot, draw.episode, draw.tick)
-        reading += effects.gyro_noise_rad_s_sqrt_hz / np.sqrt(dt) * noise
+        reading += effects.gyro_noise_rad_s_sqrt_hz / np.sqrt(dt) * like(noise, reading)
     return reading
 
 
@@ -132,8 +133,8 @@ def measured_fix(body: Body, motion: Motion, effects: Effects, draw: Draw) -> Fi
         noise_x, noise_y = normal_pair(
             draw.seed, POSITION_NOISE, draw.robot, draw.episode, draw.tick
         )
-        x += effects.position_noise_std_mm * noise_x
-        y += effects.position_noise_std_mm * noise_y
+        x += effects.position_noise_std_mm * like(noise_x, x)
+        y += effects.position_noise_std_mm * like(noise_y, y)
     return Fix(x=x, y=y, here=1.0, age=0.0, way_x=0.0, way_y=0.0)
 
 
@@ -180,7 +181,7 @@ def with_outlier(fix: Fix, effects: Effects, draw: Draw) -> Fix:
         draw.seed, POSITION_OUTLIER, draw.robot, draw.episode, 2 * draw.tick + 1
     )
     std = effects.position_outlier_std_mm
-    return with_position(fix, fix.x + std * far_x, fix.y + std * far_y)
+    return with_position(fix, fix.x + std * like(far_x, fix.x), fix.y + std * like(far_y, fix.y))
 
 
 @law

@@ -27,6 +27,7 @@ class Settings(NamedTuple):
     collides: bool  # robots that are near are stepped through a space with contact
     round_outlines: bool  # outlines are circles, so that compiled laws can say which touch
     substeps: int
+    number: float  # 1, of the precision in which substeps are computed
     dt: float  # physics period, s
     period: float  # control period, s
     gap: int  # control steps of the time gap
@@ -75,6 +76,7 @@ def make_settings(scenario: Scenario) -> Settings:
         collides=scenario.plant in ("pymunk", "chipmunk"),
         round_outlines=all(one.outline_polygon_mm is None for one in scenario.robot_models),
         substeps=scenario.substeps,
+        number=1.0,
         dt=scenario.physics_period_s,
         period=scenario.control_period_s,
         gap=scenario.gap_steps,

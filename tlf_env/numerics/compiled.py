@@ -44,6 +44,7 @@ from numba.core.compiler_machinery import PassManager, register_pass
 from numba.core.registry import CPUDispatcher
 from numba.core.typed_passes import NativeLowering, NopythonRewrites
 from numba.core.types.misc import unliteral
+from numba.core.typing.typeof import Purpose, typeof_impl
 from numba.core.untyped_passes import (
     FindLiterallyCalls,
     InlineClosureLikes,
@@ -397,16 +398,62 @@ class _Driver(CPUDispatcher):
                     self._cache.unlock()
 
 
+class _Constants:
+    """Of which precision the constants are in what is being compiled; see :func:`by_number`."""
+
+    single = False
+
+    @contextmanager
+    def precision(self, single: bool) -> Iterator[None]:
+        """In single precision, or in double."""
+        before, self.single = self.single, single
+        try:
+            yield
+        finally:
+            self.single = before
+
+
+_constants = _Constants()
+
+
+@typeof_impl.register(float)
+def _type_of_float(value: float, context: Any) -> Any:
+    """As Numba has it, unless it is a constant of code in single precision."""
+    single = _constants.single and context.purpose is Purpose.constant
+    return types.float32 if single else types.float64
+
+
 class _Inner(CPUDispatcher):
     """A function for compiled code. For Python it is compiled a second time, when Python first calls it.
 
-    What Python needs to call a function takes long to compile, most of all for tuples of arrays.
+    What Python needs to call a function takes long to compile, most of all for tuples of arrays. In single
+    precision it is a third function, with other constants.
     """
+
+    def is_single(self, args: Any) -> bool:
+        """Whether a call with arguments of these types has constants in single precision: as its caller."""
+        return _constants.single
+
+    def _of(self, single: bool) -> _Inner:
+        """The function with constants of this precision."""
+        if not single:
+            return self
+        if not hasattr(self, "_single"):
+            self._single = type(self)(
+                self.py_func, targetoptions=self.targetoptions, pipeline_class=_LinkedCompiler
+            )
+        return self._single
 
     def get_call_template(self, args: Any, kws: Any) -> Any:
         """What a call has: a constant argument is one of its type, not a function of its own."""
         plain = {name: unliteral(one) for name, one in kws.items()}
-        return super().get_call_template(tuple(unliteral(one) for one in args), plain)
+        given, single = tuple(unliteral(one) for one in args), self.is_single(args)
+        with _constants.precision(single):
+            return CPUDispatcher.get_call_template(self._of(single), given, plain)
+
+    def get_overload(self, sig: Any) -> Any:
+        """What a call with these types is linked to."""
+        return CPUDispatcher.get_overload(self._of(self.is_single(sig)), sig)
 
     def _insert(self, *_: Any) -> None:
         """Keep what was compiled from Python, which could not call it."""
@@ -419,13 +466,25 @@ class _Inner(CPUDispatcher):
         return self._for_python
 
 
-def _inner(function: F, **options: bool) -> F:
+class _Double(_Inner):
+    def is_single(self, args: Any) -> bool:
+        """Never."""
+        return False
+
+
+class _ByNumber(_Inner):
+    def is_single(self, args: Any) -> bool:
+        """Whether the first argument is a number, or an array of numbers, of single precision."""
+        return bool(getattr(args[0], "dtype", args[0]) == types.float32)
+
+
+def _inner(function: F, of: type[_Inner] = _Inner, **options: bool) -> F:
     """Compile a function that compiled code calls."""
     if numba.config.DISABLE_JIT:
         return function
     common = {"nopython": True, "nogil": True, "error_model": "numpy"}
     without = {"no_cpython_wrapper": True, "no_cfunc_wrapper": True}
-    dispatcher: F = _Inner(
+    dispatcher: F = of(
         function,
         targetoptions={**common, **without, **options},
         pipeline_class=_LinkedCompiler,
@@ -443,6 +502,23 @@ def law(function: F) -> F:
     count is an atomic write that threads would wait for. So they make no arrays, only views.
     """
     return _inner(function, forceinline=True, _nrt=False)
+
+
+def law_in_double(function: F) -> F:
+    """A law whose constants are of double precision, also where it is called from code in single precision.
+
+    Its arguments are what the caller gives; see :func:`tlf_env.numerics.memory.like`.
+    """
+    return _inner(function, _Double, forceinline=True, _nrt=False)
+
+
+def by_number(function: F) -> F:
+    """A block in the precision of its first argument: a number, or an array of numbers.
+
+    In single precision all float constants of what it calls are single, too: otherwise every sum with a
+    constant would be computed in double precision.
+    """
+    return _inner(function, _ByNumber, forceinline=False)
 
 
 def block(function: F) -> F:

@@ -18,14 +18,13 @@ DOUBLE_BYTES = 8
 def _array_at(context: Any, builder: Any, array: Any, memory: Any, shape: tuple[int, int]) -> Any:
     """An array struct of a constant shape over some memory that it does not own."""
     made = context.make_array(array)(context, builder)
+    size = array.dtype.bitwidth // 8
     context.populate_array(
         made,
         data=builder.bitcast(memory, made.data.type),
         shape=[context.get_constant(types.intp, one) for one in shape],
-        strides=[
-            context.get_constant(types.intp, one) for one in (shape[1] * DOUBLE_BYTES, DOUBLE_BYTES)
-        ],
-        itemsize=context.get_constant(types.intp, DOUBLE_BYTES),
+        strides=[context.get_constant(types.intp, one) for one in (shape[1] * size, size)],
+        itemsize=context.get_constant(types.intp, size),
         meminfo=None,
     )
     return made._getvalue()
@@ -56,6 +55,48 @@ def table(_context: Any, rows: Any, columns: Any) -> Any:
         return _array_at(context, builder, array, memory, shape)
 
     return array(rows, columns), build
+
+
+@intrinsic(prefer_literal=True)
+def table_of(_context: Any, number: Any, rows: Any) -> Any:
+    """As :func:`table`, of numbers such as ``number``, each row a cache line."""
+    return _lines(types.Array(number, 2, "C"), number, rows)
+
+
+@intrinsic(prefer_literal=True)
+def integers_beside(_context: Any, number: Any, rows: Any) -> Any:
+    """Whole numbers (int64), as many in each row as in those of :func:`table_of`."""
+    return _lines(types.Array(types.int64, 2, "C"), number, rows)
+
+
+@intrinsic(prefer_literal=True)
+def doubles_beside(_context: Any, number: Any, rows: Any) -> Any:
+    """Doubles, as many in each row as in those of :func:`table_of`."""
+    return _lines(types.Array(types.float64, 2, "C"), number, rows)
+
+
+def _lines(array: Any, number: Any, rows: Any) -> Any:
+    """What an intrinsic returns that makes a table with as many columns as numbers fit into a cache line."""
+    shape = rows.literal_value, CACHE_LINE_BYTES * 8 // number.bitwidth
+    bits = ir.IntType(array.dtype.bitwidth)
+
+    def build(context: Any, builder: Any, _signature: Any, _values: Any) -> Any:
+        with builder.goto_entry_block():
+            memory = builder.alloca(ir.ArrayType(bits, shape[0] * shape[1]))
+            memory.align = CACHE_LINE_BYTES
+        return _array_at(context, builder, array, memory, shape)
+
+    return array(number, rows), build
+
+
+@intrinsic
+def like(_context: Any, value: Any, number: Any) -> Any:
+    """A number in the precision of another one."""
+
+    def build(context: Any, builder: Any, _signature: Any, values: Any) -> Any:
+        return context.cast(builder, values[0], value, number)
+
+    return number(value, number), build
 
 
 @intrinsic(prefer_literal=True)

@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from tlf_env.numerics.compiled import law
+from tlf_env.numerics.compiled import law, law_in_double
 from tlf_env.numerics.trig import log, sincos
 
 MULTIPLIER_0 = np.uint64(0xD2E7470EE14C6C93)
@@ -73,20 +73,20 @@ def philox(
     return two_rounds(c_0, c_1, c_2, c_3, k_0 + WEYL_0 * EIGHT, k_1 + WEYL_1 * EIGHT)
 
 
-@law
+@law_in_double
 def words(seed: int, channel: int, robot: int, episode: int, index: int) -> Words:
     """The four words of one draw; all arguments are non-negative whole numbers."""
     key = (np.uint64(channel) << SHIFT_32) | np.uint64(robot)
     return philox(np.uint64(index), np.uint64(episode), ZERO, ZERO, np.uint64(seed), key)
 
 
-@law
+@law_in_double
 def unit(word: np.uint64) -> float:
     """A float in [0, 1) from the upper 53 bits of a word."""
     return float(word >> SHIFT_11) * UNIT
 
 
-@law
+@law_in_double
 def normal_pair(
     seed: int, channel: int, robot: int, episode: int, index: int
 ) -> tuple[float, float]:

@@ -98,7 +98,8 @@ def _words(value: Any, kind: types.Type) -> Iterator[int]:
         for one, part in zip(value, kind, strict=True):
             yield from _words(one, part)
     elif isinstance(kind, types.Float):
-        yield struct.unpack("q", struct.pack("d", value))[0]
+        layout = "fxxxx" if kind == types.float32 else "d"
+        yield struct.unpack("q", struct.pack(layout, value))[0]
     else:
         yield int(value)
 

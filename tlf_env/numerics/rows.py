@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tlf_env.numerics.compiled import law
+from tlf_env.numerics.compiled import law, law_in_double
+from tlf_env.numerics.memory import like
 
 
 def replacing(row: type[Any], *names: str) -> Callable[..., Any]:
@@ -28,6 +29,14 @@ def replacing(row: type[Any], *names: str) -> Callable[..., Any]:
     scope: dict[str, Any] = {"_Row": row}
     exec(f"def replace(_old, {', '.join(names)}):\n    return _Row({fields})\n", scope)
     return law(scope["replace"])
+
+
+def doubling(row: type[Any]) -> Callable[..., Any]:
+    """Compiled ``in_double(row)``: the row with its numbers in double precision."""
+    fields = ", ".join(f"like(row.{name}, ONE)" for name in row._fields)
+    scope: dict[str, Any] = {"Row": row, "like": like, "ONE": 1.0}
+    exec(f"def in_double(row):\n    return Row({fields})\n", scope)
+    return law_in_double(scope["in_double"])
 
 
 def choosing(row: type[Any]) -> Callable[..., Any]:
