@@ -96,7 +96,7 @@ from tlf_env.numerics.memory import (
     table,
     table_of,
 )
-from tlf_env.numerics.rows import choosing, doubling, replacing
+from tlf_env.numerics.rows import choosing, doubling, replacing, row_reader
 from tlf_env.onboard.kinds import EKF, EKF_GYRO, EKF_SLIP
 from tlf_env.onboard.speed_observer import observed_speeds
 from tlf_env.physics.vehicle import (
@@ -131,12 +131,13 @@ LIMITING = np.array(
 NOT_PULLING = np.zeros(len(PULLING))
 NOT_LIMITING = np.array([0.0, 0.0, 1.0, 1.0])
 
-MOST_ALONE = 2  # sliding robots of a tile that are faster one by one than side by side
+MOST_ALONE = 2  # sliding robots of eight that are faster one by one than side by side
 
 SPEED_OBSERVERS = np.array([in_tile("speed_observer", "angle")])
 NO_SPEED_OBSERVER = np.zeros(1)
 
 body_of = tile_reader("body")
+body_at = row_reader(Body, in_array("body"))  # of flat constants
 belief_of = tile_reader("belief")
 speed_observer_of = tile_reader("speed_observer")
 loop_of = tile_reader("wheel_loop")
@@ -545,14 +546,35 @@ def hand_over(
 
 
 @law_in_double
-def slide_alone(tile: np.ndarray, count: int, dt: float) -> None:
-    """By sweeps, robot by robot, those whose wheels do not all roll.
+def exact_body(tile: np.ndarray, numbers: np.ndarray, constants: np.ndarray, i: int) -> Body:
+    """A robot's body in double precision.
+
+    Rounded, a mass times its inverse is not 1, and sweeps with such numbers never come to their tolerance.
+    """
+    if is_single(tile):
+        return body_at(constants, numbers[COLUMN, i])
+    return double_body(body_of(tile, i))
+
+
+@law_in_double
+def slide_alone(
+    tile: np.ndarray,
+    numbers: np.ndarray,
+    constants: np.ndarray,
+    first: int,
+    last: int,
+    dt: float,
+) -> None:
+    """By sweeps, robot by robot, those from ``first`` to before ``last`` whose wheels do not all roll.
 
     In double precision, as the sweeps stop at a tolerance that single precision does not reach.
     """
-    for i in range(count):
+    for i in range(first, last):
         if tile[ROLLS, i] == 0.0:
-            body, traction = double_body(body_of(tile, i)), double_traction(traction_of(tile, i))
+            body, traction = (
+                exact_body(tile, numbers, constants, i),
+                double_traction(traction_of(tile, i)),
+            )
             motion, impulses = slide(
                 body,
                 double_motion(motion_of(tile, i)),
@@ -568,39 +590,43 @@ def slide_alone(tile: np.ndarray, count: int, dt: float) -> None:
 
 
 @law_in_double
-def slide_together(tile: np.ndarray, dt: float) -> None:
-    """By sweeps, side by side, those whose wheels do not all roll; in double precision."""
+def slide_together(
+    tile: np.ndarray, numbers: np.ndarray, constants: np.ndarray, first: int, dt: float
+) -> None:
+    """By sweeps, side by side, those of eight robots from ``first`` on whose wheels do not all roll."""
     sweeps = table(SLIDE_ROWS, SLIDE_COLUMNS)
-    for first in range(0, tile.shape[1], SLIDE_COLUMNS):
-        for k in range(SLIDE_COLUMNS):
-            i = first + k
-            body, traction = double_body(body_of(tile, i)), double_traction(traction_of(tile, i))
-            begin_slide(
-                sweeps,
-                k,
-                tile[ROLLS, i] == 0.0,
-                body,
-                double_motion(motion_of(tile, i)),
-                double_contact(contact_of(tile, i)),
-                floor_under(body, double_effects(effects_of(tile, i)), traction),
-                double_push(push_of(tile, i)),
-                traction.delivered_l,
-                traction.delivered_r,
-                like(dt, 1.0),
-            )
-        sweep_together(sweeps)
-        for k in range(SLIDE_COLUMNS):
-            i = first + k
-            slides = tile[ROLLS, i] == 0.0
-            motion, impulses = end_slide(
-                sweeps, k, double_motion(motion_of(tile, i)), like(dt, 1.0)
-            )
-            set_moved(tile, i, chosen_motion(slides, motion, moved_of(tile, i)))
-            set_impulses(tile, i, chosen_contact(slides, impulses, impulses_of(tile, i)))
+    for k in range(SLIDE_COLUMNS):
+        i = first + k
+        body, traction = (
+            exact_body(tile, numbers, constants, i),
+            double_traction(traction_of(tile, i)),
+        )
+        begin_slide(
+            sweeps,
+            k,
+            tile[ROLLS, i] == 0.0,
+            body,
+            double_motion(motion_of(tile, i)),
+            double_contact(contact_of(tile, i)),
+            floor_under(body, double_effects(effects_of(tile, i)), traction),
+            double_push(push_of(tile, i)),
+            traction.delivered_l,
+            traction.delivered_r,
+            like(dt, 1.0),
+        )
+    sweep_together(sweeps)
+    for k in range(SLIDE_COLUMNS):
+        i = first + k
+        slides = tile[ROLLS, i] == 0.0
+        motion, impulses = end_slide(sweeps, k, double_motion(motion_of(tile, i)), like(dt, 1.0))
+        set_moved(tile, i, chosen_motion(slides, motion, moved_of(tile, i)))
+        set_impulses(tile, i, chosen_contact(slides, impulses, impulses_of(tile, i)))
 
 
 @law
-def move(tile: np.ndarray, count: int, dt: float) -> None:
+def move(
+    tile: np.ndarray, numbers: np.ndarray, constants: np.ndarray, count: int, dt: float
+) -> None:
     """The plant: all in closed form, then by sweeps those whose wheels do not all roll."""
     for i in range(tile.shape[1]):
         body, traction = body_of(tile, i), traction_of(tile, i)
@@ -617,14 +643,16 @@ def move(tile: np.ndarray, count: int, dt: float) -> None:
         set_moved(tile, i, motion)
         set_impulses(tile, i, impulses)
         tile[ROLLS, i] = 1.0 if rolls else 0.0
-    sliding = 0
-    for i in range(count):
-        if tile[ROLLS, i] == 0.0:
-            sliding += 1
-    if sliding > MOST_ALONE:
-        slide_together(tile, dt)
-    elif sliding > 0:
-        slide_alone(tile, count, dt)
+    for first in range(0, tile.shape[1], SLIDE_COLUMNS):
+        last = min(first + SLIDE_COLUMNS, count)
+        sliding = 0
+        for i in range(first, last):
+            if tile[ROLLS, i] == 0.0:
+                sliding += 1
+        if sliding > MOST_ALONE:
+            slide_together(tile, numbers, constants, first, dt)
+        elif sliding > 0:
+            slide_alone(tile, numbers, constants, first, last, dt)
     for i in range(tile.shape[1]):
         motion, impulses = moved_of(tile, i), impulses_of(tile, i)
         limit = body_of(tile, i).torque_limit
@@ -984,7 +1012,7 @@ def advance_in(
                     if settings.by_chipmunk:
                         hand_over(arrays.inputs, lanes_in_all, tile, numbers, count)
                     else:
-                        move(tile, count, dt)
+                        move(tile, numbers, constants, count, dt)
             if senses:
                 measure(tile, numbers, needs, dt)
                 due = count_to_fixes(tile) if needs.fixes else DueFixes(True, True)
