@@ -13,7 +13,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from tlf_env.common.errors import shown
-from tlf_env.engine.batch import BatchPlant, Source, checked_count
+from tlf_env.engine.batch import DOUBLE, BatchPlant, Source, checked_count
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import real_numbers
 from tlf_env.task.actions import ACTION_SIZE
@@ -56,6 +56,9 @@ class FormationVecEnv(VecEnv):
     staggered
         Whether the first episodes end at different times, each task's formations spread over its horizon;
         as in :class:`~tlf_env.engine.batch.BatchPlant`.
+    precision
+        ``"double"`` or ``"single"``, of the numbers in the substeps; as in
+        :class:`~tlf_env.engine.batch.BatchPlant`.
     threads
         Number of threads for a step; None: one per core.
     seed
@@ -84,6 +87,7 @@ class FormationVecEnv(VecEnv):
         *,
         mixture: bool | Sequence[float] = False,
         staggered: bool = False,
+        precision: str = DOUBLE,
         threads: int | None = 1,
         seed: int | None = None,
         infos: InfoChoice = CHEAP_INFOS,
@@ -105,6 +109,7 @@ class FormationVecEnv(VecEnv):
                 threads=threads,
                 mixture=mixture,
                 staggered=staggered,
+                precision=precision,
                 **overrides,
             )
             for task, share in zip(tasks, shares, strict=True)

@@ -19,7 +19,7 @@ from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
 from tlf_env.engine import judging, readout
-from tlf_env.engine.batch import BatchPlant, Source, checked_count
+from tlf_env.engine.batch import DOUBLE, BatchPlant, Source, checked_count
 from tlf_env.engine.formation import STATE_SCALES
 from tlf_env.numerics.philox import MAX_SEED
 from tlf_env.task.actions import ACTION_SIZE
@@ -74,6 +74,7 @@ class FormationBatchEnv(EnvBase):
         formations: int = 64,
         *,
         staggered: bool = True,
+        precision: str = DOUBLE,
         threads: int | None = 1,
         seed: int | None = None,
         infos: InfoChoice = False,
@@ -84,7 +85,12 @@ class FormationBatchEnv(EnvBase):
         super().__init__(device=device, batch_size=(checked_count("formations", formations),))
         overrides = learners_action(scenario, overrides)
         self.plant = BatchPlant(
-            scenario, formations, threads=threads, staggered=staggered, **overrides
+            scenario,
+            formations,
+            threads=threads,
+            staggered=staggered,
+            precision=precision,
+            **overrides,
         )
         if TIME_GAP_KEY not in self._info_keys:
             self.plant.compute_time_gap_of([])

@@ -257,7 +257,7 @@ def one_by_one(a: Arrays, s: Settings) -> None:
 
 @driver
 def in_tiles(a: Arrays, lanes: np.ndarray, s: Settings) -> None:
-    advance(a, lanes, 0, s.substeps, True, True, s)
+    advance(s.number, a, lanes, 0, s.substeps, True, True, s)
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "ekf-slip", "ekf-gyro"])
@@ -280,7 +280,7 @@ def test_a_tile_gives_the_bits_of_the_laws_run_one_by_one(disturbance, estimator
 @driver
 def substep_by_substep(a: Arrays, lanes: np.ndarray, s: Settings) -> None:
     for k in range(s.substeps):
-        advance(a, lanes, k, k + 1, True, True, s)
+        advance(s.number, a, lanes, k, k + 1, True, True, s)
 
 
 @pytest.mark.parametrize("estimator", ["ekf", "ekf-slip", "ekf-gyro", "truth"])

@@ -46,7 +46,16 @@ def timed_step(arrays: Arrays, settings: Settings, spent: np.ndarray) -> None:
         take_all_actions(arrays, begin, end, settings)
         find_near(arrays, begin, end, near, settings)
         acted = processor_time_us()
-        advance(arrays, lanes[: end - begin], 0, settings.substeps, True, True, settings)
+        advance(
+            settings.number,
+            arrays,
+            lanes[: end - begin],
+            0,
+            settings.substeps,
+            True,
+            True,
+            settings,
+        )
         advanced = processor_time_us()
         transmit_all(arrays, begin, end, arrays.states.shape[1], settings)
         transmitted = processor_time_us()
@@ -65,6 +74,7 @@ def timed_sensing(arrays: Arrays, settings: Settings, spent: np.ndarray) -> None
     for begin in range(0, lanes.shape[0], LANES_AT_ONCE):
         start = processor_time_us()
         advance(
+            settings.number,
             arrays,
             lanes[begin : begin + LANES_AT_ONCE],
             0,

@@ -41,10 +41,11 @@ def use_device() -> None:
 
     dispatcher.get_current_device = Device
     compiled.law = compiled.block = compiled.allocating = compiled.view = on_device
+    compiled.law_in_double = compiled.by_number = on_device
     compiled.driver = lambda function: function
     of_processor = numba.extending.intrinsic
     numba.extending.intrinsic = extending.intrinsic
-    from tlf_env.numerics import angles, trig
+    from tlf_env.numerics import angles, memory, trig  # noqa: F401 (`like` for the device)
 
     numba.extending.intrinsic = of_processor  # no kernel uses those of the other modules
     from tlf_env.engine import sensors

@@ -44,7 +44,7 @@ MAY_DIFFER = ("name", "robots", "robot", "wheel_loop", "ekf", "ekf_slip", "ekf_g
 
 
 DOUBLE = "double"
-PRECISIONS: dict[str, type[np.floating[Any]]] = {DOUBLE: np.float64, "single": np.float32}
+PRECISIONS: dict[str, Any] = {DOUBLE: np.float64, "single": np.float32}
 
 
 class BatchPlant:

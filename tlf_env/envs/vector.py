@@ -15,7 +15,7 @@ from gymnasium.vector.utils import batch_space
 
 from tlf_env.common.errors import shown
 from tlf_env.engine import judging
-from tlf_env.engine.batch import BatchPlant, checked_count
+from tlf_env.engine.batch import DOUBLE, BatchPlant, checked_count
 from tlf_env.engine.excerpt import END_ROW, REWARD_ROW, Excerpt
 from tlf_env.engine.snapshot import Snapshot, checked_generator, checked_snapshot
 from tlf_env.envs.single import BY_REFERENCE, HasSpec
@@ -75,6 +75,9 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
     staggered
         Whether the first episodes end at different times; as in
         :class:`~tlf_env.engine.batch.BatchPlant`.
+    precision
+        ``"double"`` or ``"single"``, of the numbers in the substeps; as in
+        :class:`~tlf_env.engine.batch.BatchPlant`.
     autoreset_mode
         ``NextStep`` (Gymnasium's default), ``SameStep`` or ``Disabled``.
     max_episode_steps
@@ -106,6 +109,7 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         threads: int | None = 1,
         mixture: bool | Sequence[float] = False,
         staggered: bool = False,
+        precision: str = DOUBLE,
         autoreset_mode: str | AutoresetMode = AutoresetMode.NEXT_STEP,
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
@@ -122,6 +126,7 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             threads=threads,
             mixture=mixture,
             staggered=staggered,
+            precision=precision,
             **learners_action(scenario, overrides),
         )
         self._info_keys = chosen_keys(infos)
