@@ -16,9 +16,7 @@ from tlf_env.physics.parameters import RobotParameters
 SPREADS = {"default": 1.0, "near": 2.0, "wide": 10.0, "extreme": 1000.0}
 SHARES = (0.25, 0.35, 0.3, 0.1)
 MILD_SHARES = (0.5, 0.45, 0.05, 0.0)
-MILD = (
-    0.7  # of the cases: usual robots, which nobody throws about, under disturbances of usual sizes
-)
+MILD = 0.7  # of the cases: usual robots, never thrown about, under disturbances of usual sizes
 MILD_DECADES = (-4.0, -1.5)  # of the sizes of disturbances, as shares of what is allowed
 DECADES = (-4.0, 0.0)
 DEFAULT = RobotParameters()

@@ -35,6 +35,9 @@ ROUNDING = float(np.finfo(float).eps)
 SOME_ROUNDINGS = 64 * ROUNDING  # of a friction limit
 STILL_MM_S = 1e-9  # sweeps end when no velocity changes by more
 STICKS = 1.0 - 1e-9  # of the circle: an impulse below sticks
+KNOWN = (
+    SOME_ROUNDINGS / 1e-9
+)  # of its largest value: a smaller limit is not known well enough for that
 TINY = 1e-300
 SMALLEST = 1e-280  # a sum of terms above the numbers that are kept with fewer digits
 
@@ -412,9 +415,10 @@ def audit(
         size += (much + begun[k]) ** 2 * ease[k]
         press = loads[k] * grips[k] * dt
         circle = mu_at(lasts[k], r.tyre_s, r.tyre_d, r.tyre_v_s, r.tyre_v_d) * press
-        most = r.tyre_s * grips[k] * dt * r.m * r.g
+        # With a castor or a drive wheel on ice the rounding is that of the forces on the others.
+        most = r.tyre_s * max(u.grip_l, u.grip_r, u.grip_c) * dt * r.m * r.g
         over = max(over, beyond(much, circle, most))
-        if circle > SOME_ROUNDINGS * most:
+        if circle > KNOWN * most:
             soft = u.creep * abs(rims[k]) / (loads[k] * dt)
             off, slid = off_direction(p_1, p_2, x_1 + soft * p_1, y_1 + soft * p_2, circle)
             slip = max(slip, off)
@@ -452,7 +456,7 @@ def audit(
         gain += q * new
         size += abs(q) * (abs(old) + abs(new)) + (abs(q) + abs(last)) ** 2 * soft
         joint = max(joint, beyond(abs(q), cap, static))
-        if abs(q) < cap * STICKS or q * new > 0.0:
+        if (abs(q) < cap * STICKS and cap > KNOWN * static) or q * new > 0.0:
             turn = max(turn, length * abs(new))
 
     # Friction takes the velocities from V* to V₁: ½V₁ᵀMV₁ − ½V*ᵀMV* = Σ P·gᵀV₁ − ½(V₁ − V*)ᵀM(V₁ − V*).
