@@ -33,6 +33,7 @@ from tlf_env.physics.state import Contact, Motion
 
 ROUNDING = float(np.finfo(float).eps)
 SOME_ROUNDINGS = 64 * ROUNDING  # of a friction limit
+SHARE_ROUNDING = 1e-10  # of the largest friction limit of a robot
 STILL_MM_S = 1e-9  # sweeps end when no velocity changes by more
 STICKS = 1.0 - 1e-9  # of the circle: an impulse below sticks
 KNOWN = (
@@ -307,9 +308,9 @@ def off_direction(
 def beyond(much: float, most: float, static: float) -> float:
     """How far a friction impulse is beyond its limit, over it; ``static`` is the limit's largest value.
 
-    The limit is a difference of rounded numbers.
+    The limit is a difference of rounded numbers, and the share of a tyre may be the root of one.
     """
-    if much <= most + SOME_ROUNDINGS * static:
+    if much <= most + SHARE_ROUNDING * static:
         return 0.0
     return much / most - 1.0 if most > 0.0 else math.inf
 

@@ -30,7 +30,7 @@ from tlf_env.physics.sweeps import (
 )
 from tlf_env.task.scenario import Scenario, load_scenario
 
-VARIANTS, LANES, SUBSTEPS = 32, 1536, 1000  # of a case
+VARIANTS, LANES, SUBSTEPS = 32, 512, 500  # of a case
 THROW_EVERY, THROWN = 40, 0.1  # control steps, and the share of the robots thrown then
 COUNT_EVERY = 20  # substeps between two in which all sweeps are counted
 PAYLOAD = [PATHS.index(f"payload.{name}") for name in ("mass_kg", "behind_mm", "inertia_kg_mm2")]
@@ -128,7 +128,7 @@ class Substeps:
         self.taking = packed(plant._settings._replace(has_parts=True))
         self.all_lanes = np.arange(plant.formations)
 
-    def moment(self, before: np.ndarray, last: np.ndarray, already: np.ndarray) -> Moment:
+    def moment(self, before: np.ndarray, last: np.ndarray) -> Moment:
         """What the last substep was."""
         applied = self.plant.arrays.applied[:, :, : self.plant.formations]
         return Moment(
@@ -136,7 +136,7 @@ class Substeps:
             after=flat(self.plant, "motion"),
             last=last,
             given=flat(self.plant, "contact"),
-            delivered=flat(self.plant, "trace")[TORQUES] - already,
+            delivered=flat(self.plant, "trace")[TORQUES],
             commanded=flat(self.plant, "commanded"),
             channels=applied.reshape(applied.shape[0], -1).copy(),
         )
@@ -147,9 +147,9 @@ class Substeps:
         if s.substeps == 1:
             before, last = flat(plant, "motion"), flat(plant, "contact")
             plant.step(actions)
-            yield self.moment(before, last, np.zeros((2, before.shape[1])))
+            yield self.moment(before, last)
             return
-        given, packed_settings = plant._given(), plant._packed
+        given = plant._given()
         plant.arrays.actions[:] = actions
         for lane in range(plant.formations):
             left = drivers.lanes_to_step(lane, lane + 1)
@@ -157,13 +157,24 @@ class Substeps:
             assert result == drivers.MUST_SUBSTEP, result
         for k in range(s.substeps):
             before, last = flat(plant, "motion"), flat(plant, "contact")
-            already = flat(plant, "trace")[TORQUES]
-            for part in (drivers.ACTUATE, drivers.SENSE):
-                drivers.control_step(given, self.all_lanes, self.nothing, part, k, packed_settings)
-            yield self.moment(before, last, already)
-        robots = plant.scenario.robot_count
+            # The sums begin at 0 in each substep, so that what one adds is known without rounding.
+            sums = plant.arrays.rows("trace")[TORQUES[0] : TORQUES[-1] + 1]
+            already = sums.copy()
+            sums[:] = 0.0
+            self.do(drivers.ACTUATE, k)
+            moment = self.moment(before, last)
+            sums += already
+            self.do(drivers.SENSE, k)
+            yield moment._replace(commanded=flat(plant, "commanded"))
         for part in (drivers.TRANSMIT, drivers.LOOK):
-            drivers.control_step(given, self.all_lanes, self.nothing, part, robots, packed_settings)
+            self.do(part, plant.scenario.robot_count)
+
+    def do(self, part: int, number: int) -> None:
+        """A part of a control step, of all lanes."""
+        plant = self.plant
+        drivers.control_step(
+            plant._given(), self.all_lanes, self.nothing, part, number, plant._packed
+        )
 
 
 class Finding(NamedTuple):
