@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import signal
 import sys
 import time
 from collections.abc import Callable
@@ -66,6 +67,11 @@ def timed(part: str, number: int) -> tuple[Tally, float]:
     return PARTS[part](number), time.process_time() - start
 
 
+def ignore_interrupt() -> None:
+    """Leave Ctrl-C to the process that keeps the results."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+
+
 def main() -> int:
     """Run the cases; 1 if a law was broken."""
     given = arguments()
@@ -79,8 +85,8 @@ def main() -> int:
     bar = tqdm(
         total=goal, initial=int(tally.counts.get("substeps", 0)), unit=" substeps", unit_scale=True
     )
-    with ProcessPoolExecutor(given.jobs) as pool, bar:
-        try:
+    try:
+        with ProcessPoolExecutor(given.jobs, initializer=ignore_interrupt) as pool, bar:
             while done < last and tally.counts.get("substeps", 0) < given.substeps:
                 numbers = range(done, int(min(done + given.jobs, last)))
                 for one, cpu_s in pool.map(timed, [given.part] * len(numbers), numbers):
@@ -91,8 +97,8 @@ def main() -> int:
                 if time.monotonic() > saved + SAVE_EVERY_S:
                     save(path, done, seconds, tally)
                     saved = time.monotonic()
-        except KeyboardInterrupt:
-            pass
+    except KeyboardInterrupt:
+        print("interrupted")
     save(path, done, seconds, tally)
     broken = {
         name: int(n) for name, n in tally.counts.items() if name.startswith("findings/") and n
