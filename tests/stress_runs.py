@@ -11,6 +11,7 @@ from stress_cases import Case, draw_actions, draw_case, rng_of, throw
 from stress_laws import Inputs, Owed, Payload, Work, audit_all, finite, inputs_all, robot_row
 
 from tlf_env import BatchPlant
+from tlf_env.common.presets import preset_names
 from tlf_env.disturbances.channels import DEAD_TIME, PATHS
 from tlf_env.disturbances.model import patch_rows
 from tlf_env.engine import drivers
@@ -443,4 +444,22 @@ def run_case(
                 moments(audited, moment, owed)
         audited.look()
     audited.close()
+    return audited.tally
+
+
+def preset_case(number: int, lanes: int = 32, steps: int = 60) -> Tally:
+    """Run a preset of a disturbance in the closed loop of a task, from its start: ordinary scenarios."""
+    names = preset_names("disturbance")
+    task, name = ("infinity", "flower")[number // len(names) % 2], names[number % len(names)]
+    options = {"disturbance": name, "action": "residual", "end_on": ()}
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        plant = BatchPlant(load_scenario(task, **options), lanes)
+    plant.reset(seed=number)
+    case = Case(number, [], ["default"], False, steps)
+    audited, stepped = Audit(case, plant), Substeps(plant)
+    for _ in range(steps):
+        for moment in stepped.step(np.zeros(plant.arrays.actions.shape)):
+            audited.take(moment)
+        audited.look()
     return audited.tally

@@ -1,6 +1,7 @@
 """Physics under stress: random robots, floors, disturbances and actions, and an audit of every substep.
 
     python tests/campaign/stress.py batch --substeps 1e8
+    python tests/campaign/stress.py presets --cases 66
     python tests/campaign/stress.py contact --substeps 1e6
     python tests/campaign/stress.py chipmunk --substeps 1e6
     python tests/campaign/stress.py agree --cases 40
@@ -26,12 +27,13 @@ sys.path.insert(0, str(Path(__file__).parents[1]))
 
 from stress_agree import agree_case
 from stress_formations import chipmunk_case, contact_case
-from stress_runs import Tally, run_case
+from stress_runs import Tally, preset_case, run_case
 
 from tlf_env.common.files import atomic
 
 PARTS: dict[str, Callable[[int], Tally]] = {
     "batch": run_case,
+    "presets": preset_case,
     "contact": contact_case,
     "chipmunk": chipmunk_case,
     "agree": agree_case,
