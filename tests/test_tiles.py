@@ -318,6 +318,37 @@ def test_what_fixes_the_others_in_a_tile_get_does_not_matter():
             assert (alone.arrays.rows(name)[:, :, 0] == many.arrays.rows(name)[:, :, k]).all()
 
 
+@pytest.mark.parametrize(
+    "others",
+    [
+        {"actuator": {"current_limit": 0.5}},
+        {"actuator": {"dead_band_Nmm": 1.0}},
+        {"actuator": {"back_emf_s_rad": 0.01}},
+        {"push": {"x_N": 0.3}, "floor": {"slope_rad": 0.05}},
+        {"encoder": {"noise_std_rad": 1e-3}, "gyro": {"bias_rad_s": 0.1}},
+        {"tyre": {"creep": 0.1}, "slip": {"left_mm_s": 10.0}},
+    ],
+    ids=str,
+)
+def test_what_disturbs_the_others_in_a_tile_does_not_matter(others):
+    """A gain that delivers more than the commands' limit, beside robots whose motors are limited."""
+    own = {"actuator": {"torque_gain_l": 1.5, "torque_gain_r": 1.2}}
+    mine, theirs = (
+        load_scenario("infinity", plant="batch", action="torque", end_on=(), disturbance=one)
+        for one in (own, others)
+    )
+    alone, among = BatchPlant(mine, 4), BatchPlant([mine, theirs], 4)
+    for plant in (alone, among):
+        plant.reset(seed=3)
+        for _ in range(10):
+            plant.step(np.ones(plant.arrays.actions.shape))
+    assert among.scenario_numbers.tolist() == [0, 1, 0, 1]
+    for name in ("motion", "contact", "estimate"):
+        got, wanted = among.arrays.rows(name)[:, :, ::2], alone.arrays.rows(name)[:, :, ::2]
+        assert got.tobytes() == wanted.tobytes()
+    assert alone.info("torque_l_Nmm") == pytest.approx(1.5 * 15.0)
+
+
 @pytest.mark.parametrize(("observation", "kept"), [("tracking", False), ("sensor", True)])
 def test_the_samples_of_all_substeps_are_kept_for_those_who_read_them(observation, kept):
     plant = BatchPlant("infinity", 2, observation=observation)

@@ -468,9 +468,24 @@ def differ(tile: np.ndarray, rows: np.ndarray, values: np.ndarray) -> bool:
 
 
 @law
+def differs(tile: np.ndarray, i: int, rows: np.ndarray, values: np.ndarray) -> bool:
+    """Whether one of some rows has another value than given, for the robot in column ``i``."""
+    found = False
+    for f in range(rows.shape[0]):
+        found |= tile[rows[f], i] != values[f]
+    return found
+
+
+@law
 def limit_motors(tile: np.ndarray, count: int) -> None:
-    """Deliver what the motors can."""
+    """Deliver what the motors can.
+
+    A gain may deliver more than the limit of the command. So a robot whose own channels limit nothing is
+    left as it is, as in a tile in which none do.
+    """
     for i in range(count):
+        if not differs(tile, i, LIMITING, NOT_LIMITING):
+            continue
         body, effects, traction = body_of(tile, i), effects_of(tile, i), traction_of(tile, i)
         motion = motion_of(tile, i)
         delivered_l = motor_torque(traction.delivered_l, motion.omega_l, body.torque_limit, effects)
