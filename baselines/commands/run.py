@@ -113,6 +113,7 @@ def run_command(
             options=options,
             progress=update,
             watch=film,
+            keep_interrupted=True,
         )
     written = write_run(record, folder, identity, wanted)
     if wanted.out is None:
