@@ -434,7 +434,9 @@ def prepare(place: Path, job: Job) -> None:
         (place / name).write_text(yaml.safe_dump(content), encoding="utf-8")
 
 
-def run_whole(place: Path, job: Job, start: Callable[..., Started], limit_s: float = 300) -> Started:
+def run_whole(
+    place: Path, job: Job, start: Callable[..., Started], limit_s: float = 300
+) -> Started:
     """Run a job to its end.
 
     Raises
@@ -445,7 +447,9 @@ def run_whole(place: Path, job: Job, start: Callable[..., Started], limit_s: flo
     started = start(place, job.words)
     try:
         if started.wait(limit_s):
-            raise RuntimeError(f"tlf {job.words[0]} ended with {started.status()}: {started.said()}")
+            raise RuntimeError(
+                f"tlf {job.words[0]} ended with {started.status()}: {started.said()}"
+            )
     finally:
         started.end()
     return started

@@ -123,7 +123,9 @@ def kill_job(
             started = start(place, job.words)
             killed = kill_at_random(started, folder, rng, whole_s, whole_changes)
             if not killed and started.status():
-                wrong = [f"before the kill it ended with {started.status()}: {started.said()[-500:]}"]
+                wrong = [
+                    f"before the kill it ended with {started.status()}: {started.said()[-500:]}"
+                ]
             else:
                 now, wrong = job.finished(folder), jobs.half_written(folder)
                 wrong += [f"lost: {one[:200]}" for one in jobs.lost(job, finished, now)]
