@@ -267,11 +267,16 @@ def test_what_is_left_of_a_line_is_cut_before_the_next(tmp_path):
     append_line(path, {"number": 1})
     with path.open("ab") as file:
         file.write(b'{"number": 2, "other')
-    assert [*read_lines(path, lambda line: line["number"])] == [1]
     append_line(path, {"number": 3})
+    assert [*read_lines(path, lambda line: line["number"])] == [1, 3]
+    with path.open("ab") as file:
+        file.write(b'{"number": 4, "other')
+    assert [*read_lines(path, lambda line: line["number"])] == [1, 3]
+    append_line(path, {"number": 5})
     assert [json.loads(line) for line in path.read_text().splitlines()] == [
         {"number": 1},
         {"number": 3},
+        {"number": 5},
     ]
 
 
@@ -324,6 +329,65 @@ def test_an_error_of_the_disk_names_the_file(tmp_path):
     (tmp_path / "no folder").write_text("a file", encoding="utf-8")
     with pytest.raises(OSError, match=r"no folder"), atomic(tmp_path / "no folder" / "a") as file:
         file.write("never")
+
+
+@pytest.mark.parametrize("mode", ["full", "read only"])
+def test_a_search_whose_database_cannot_be_written_does_not_advise_to_remove_it(mode, tmp_path):
+    """And its finished trials are there when there is room again."""
+    pytest.importorskip("optuna")
+    import optuna
+
+    from baselines.runs.trials import STUDY_FILE, TrialStore
+
+    ranges = {"x": optuna.distributions.FloatDistribution(0.0, 1.0)}
+
+    def opened() -> TrialStore:
+        return TrialStore(tmp_path, "one", ranges, sampler_seed=0, startup_trials=1)
+
+    store = opened()
+    store.tell(store.propose({"x": 0.5}).number, 1.0, {})
+    path, number = tmp_path / STUDY_FILE, errno.ENOSPC if mode == "full" else errno.EROFS
+
+    @sqlalchemy_event(store)
+    def pragma(connection) -> None:
+        how = "max_page_count = 1" if mode == "full" else "query_only = 1"
+        connection.execute(f"pragma {how}")
+
+    def go_on() -> None:
+        for _ in range(100):
+            store.tell(store.propose({"x": 0.5}).number, 1.0, {"note": "x" * 500})
+
+    with pytest.raises(OSError, match=os.strerror(number)) as failed:
+        go_on()
+    assert (failed.value.errno, failed.value.filename) == (number, str(path))
+    assert [one.value for one in opened().trials("COMPLETE")][:1] == [1.0]
+
+
+def sqlalchemy_event(store):
+    """Call a function with every connection that the store of a study makes from now on."""
+    from sqlalchemy import event
+
+    engine = store.study._storage._backend.engine
+    engine.dispose()
+
+    def register(function):
+        event.listen(engine, "connect", lambda connection, _: function(connection))
+        return function
+
+    return register
+
+
+def test_the_command_that_goes_on_after_a_full_disk_is_named(monkeypatch, capsys):
+    def work(*_, **__):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "out/runs.jsonl")
+
+    monkeypatch.setattr(cli, "app", work)
+    assert tlf(monkeypatch, "bench", "--plan", "board") == cli.FAILED
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "No space left on device: 'out/runs.jsonl'; what is finished is kept" in line
+    assert line.endswith("the same command goes on: tlf bench --plan board")
+    assert tlf(monkeypatch, "run", "circle") == cli.FAILED
+    assert capsys.readouterr().err.strip().endswith("'out/runs.jsonl'")
 
 
 # --- two at once

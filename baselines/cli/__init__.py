@@ -6,6 +6,7 @@ system; 2 for invalid input, reported in one line; 130 after an interrupt (Ctrl-
 
 from __future__ import annotations
 
+import errno
 import shlex
 import sys
 from collections.abc import Sequence
@@ -52,7 +53,7 @@ def main() -> None:
         except ValueError as error:
             fail(str(error), BAD_INPUT)
         except OSError as error:
-            fail(str(error), FAILED)
+            fail(f"{error}{after_a_full_disk(error, sys.argv[1:])}", FAILED)
         except (KeyboardInterrupt, typer.Abort):
             fail(interrupted_message(sys.argv[1:]), stopped_status())
         else:
@@ -62,9 +63,19 @@ def main() -> None:
 
 def interrupted_message(words: Sequence[str]) -> str:
     """What is printed after Ctrl-C or SIGTERM, with the command that goes on, if that can."""
+    return f"interrupted{going_on(words)}"
+
+
+def after_a_full_disk(error: OSError, words: Sequence[str]) -> str:
+    """The command that goes on once there is room, if the disk was full and the command can."""
+    return going_on(words) if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG) else ""
+
+
+def going_on(words: Sequence[str]) -> str:
+    """How to go on with a command; nothing for one that begins anew."""
     if not words or words[0] not in RESUMED:
-        return "interrupted"
-    return f"interrupted; what is finished is kept, and the same command goes on: tlf {shlex.join(words)}"
+        return ""
+    return f"; what is finished is kept, and the same command goes on: tlf {shlex.join(words)}"
 
 
 def fail(message: str, status: int) -> None:

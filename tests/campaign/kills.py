@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import os
 import random
 import shutil
 import signal
@@ -28,18 +29,21 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from campaign import jobs, record
 
 LIMIT_S = 300.0
+POLLED_EVERY_S = 0.001
 KILLS_PER_FOLDER = 6  # then the command runs to its end
 
 
 def changes(folder: Path) -> tuple[tuple[str, int, int], ...]:
     """Names, sizes and times of all files below a folder."""
     found = []
-    for path in folder.rglob("*"):
-        try:
-            status = path.stat()
-        except OSError:
-            continue
-        found.append((str(path), status.st_size, status.st_mtime_ns))
+    for parent, _, names in os.walk(folder):  # a folder that has just been removed is no error
+        for name in names:
+            path = Path(parent, name)
+            try:
+                status = path.stat()
+            except OSError:
+                continue
+            found.append((str(path), status.st_size, status.st_mtime_ns))
     return tuple(sorted(found))
 
 
@@ -58,11 +62,36 @@ def kill_at_random(
             now = changes(folder)
             left -= now != seen
             seen = now
+            time.sleep(POLLED_EVERY_S)
         time.sleep(rng.uniform(0.0, 0.004))
     killed = started.status() is None
     started.send(signal.SIGKILL)
     started.wait(30)
     return killed
+
+
+def starter(job: jobs.Job, *, forked: bool) -> Callable[..., jobs.Started]:
+    """What starts a job: a new process, or a fork of this one, which imports what the job needs."""
+    if not forked:
+        return jobs.Started
+    for module in job.imports:
+        importlib.import_module(module)
+    warm()
+    return jobs.Forked
+
+
+def warm() -> None:
+    """Load the compiled drivers, so that forks of this process have them."""
+    from baselines.policies.registry import fit_policy
+    from baselines.runs.run import run_policy, run_seeds
+    from tlf_env.task.scenario import load_scenario
+
+    for name in ("reference:linearised", "reference:consistent"):
+        fitted = fit_policy(
+            name, load_scenario("circle", horizon_s=0.1, time_gap_s=0.1, preview_s=())
+        )
+        run_policy(fitted.scenario, fitted.policy)
+        list(run_seeds(fitted.scenario, fitted.policy, [0, 1]))
 
 
 def measured(place: Path, job: jobs.Job, start: Callable[..., jobs.Started]) -> tuple[float, int]:
@@ -73,6 +102,7 @@ def measured(place: Path, job: jobs.Job, start: Callable[..., jobs.Started]) -> 
         now = changes(place / jobs.OUT)
         count += now != seen
         seen = now
+        time.sleep(POLLED_EVERY_S)
         if time.monotonic() > began + LIMIT_S:
             started.end()
             raise TimeoutError(f"tlf {job.words[0]}")
@@ -101,11 +131,7 @@ def kill_job(
         Called after every kill, and after every run to the end, with what went wrong in it.
     """
     job = jobs.with_processes(jobs.JOBS[name], processes) if processes > 1 else jobs.JOBS[name]
-    start: Callable[..., jobs.Started] = jobs.Started
-    if forked:
-        start = jobs.Forked
-        for module in job.imports:
-            importlib.import_module(module)
+    start = starter(job, forked=forked)
     rng = random.Random(f"{name} {seed}")
     whole = base / "whole"
     jobs.prepare(whole, job)
