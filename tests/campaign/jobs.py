@@ -35,6 +35,7 @@ CHECKPOINT, STUDY, LINES, SUMMARY = (
 )
 TIMES = ("wall_time_s", "processor_time_s", "evaluated_at_s")
 TENSORBOARD = "events.out.tfevents"
+REVISION = re.compile(rb"[0-9a-f]{40}\+?")  # of git: a commit during a campaign is no difference
 
 TRAINING = {
     "algorithm": "PPO",
@@ -91,9 +92,7 @@ def _bench_lines(folder: Path) -> dict[str, Any]:
     path = folder / LINES
     whole = path.read_bytes() if path.exists() else b""
     lines = whole[: whole.rfind(b"\n") + 1].splitlines()
-    return {str(number): line for number, line in enumerate(sorted(lines))} and {
-        line.decode(): True for line in lines
-    }
+    return {line.decode(): True for line in lines}
 
 
 def _bench_result(folder: Path) -> dict[str, Any]:
@@ -180,9 +179,9 @@ def _run_finished(folder: Path) -> dict[str, Any]:
 
 
 def _contents(folder: Path) -> dict[str, bytes]:
-    """Bytes of all files below a folder, TensorBoard's left out."""
+    """Bytes of all files below a folder, TensorBoard's and the revision of the sources left out."""
     return {
-        str(path.relative_to(folder)): path.read_bytes()
+        str(path.relative_to(folder)): REVISION.sub(b"", path.read_bytes())
         for path in sorted(folder.rglob("*"))
         if path.is_file() and TENSORBOARD not in path.name
     }
