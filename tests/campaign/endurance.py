@@ -188,7 +188,7 @@ def campaign_steps(outcome: record.Outcome, share: float) -> None:
             done, samples = watched(make(), int(count * share), bar.update)
         outcome.figures[name] = {
             "steps": done,
-            "first": samples[4]._asdict(),
+            "first": samples[min(4, len(samples) - 1)]._asdict(),
             "last": samples[-1]._asdict(),
         }
         outcome.case(f"{name}, steps", grown(samples), done)
@@ -197,7 +197,7 @@ def campaign_steps(outcome: record.Outcome, share: float) -> None:
         tracemalloc.stop()
         outcome.figures[f"{name}, tracemalloc"] = {
             "steps": done,
-            "first_kib": round(samples[4].traced_kib, 1),
+            "first_kib": round(samples[min(4, len(samples) - 1)].traced_kib, 1),
             "last_kib": round(samples[-1].traced_kib, 1),
         }
         outcome.case(f"{name}, steps with tracemalloc", grown(samples), done)
@@ -290,13 +290,16 @@ def campaign_many(outcome: record.Outcome, share: float) -> None:
     for name, make in MANY.items():
         with tqdm(total=count, desc=name, unit="env", mininterval=5) as bar:
             samples = made_and_closed(make, count, bar.update)
-        outcome.figures[name] = {"first": samples[4]._asdict(), "last": samples[-1]._asdict()}
+        outcome.figures[name] = {
+            "first": samples[min(4, len(samples) - 1)]._asdict(),
+            "last": samples[-1]._asdict(),
+        }
         outcome.case(f"{name}, made and closed", grown(samples), count)
         tracemalloc.start()
         samples = made_and_closed(make, max(40, count // 10))
         tracemalloc.stop()
         outcome.figures[f"{name}, tracemalloc"] = {
-            "first_kib": round(samples[4].traced_kib, 1),
+            "first_kib": round(samples[min(4, len(samples) - 1)].traced_kib, 1),
             "last_kib": round(samples[-1].traced_kib, 1),
         }
         outcome.case(
