@@ -10,6 +10,7 @@ with the status that its help promises. What was finished stays.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import random
 import shutil
@@ -21,7 +22,6 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
-import yaml
 from tqdm import tqdm
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
@@ -141,7 +141,7 @@ def stop(
     """Start a command, stop it, and look at what is left; what went wrong."""
     place.mkdir(parents=True)
     for file, content in FILES.items():
-        (place / file).write_text(yaml.safe_dump(content), encoding="utf-8")
+        (place / file).write_text(json.dumps(content), encoding="utf-8")
     started = jobs.Started(place, what.words, **what.settings)
     wrong = []
     try:
