@@ -291,7 +291,7 @@ class Interrupts:
 def test_an_interrupted_record_has_what_was_simulated():
     scenario = load_scenario("circle", horizon_s=6.0)
     whole = run_policy(scenario, ReferencePolicy())
-    part = run_policy(scenario, Interrupts(200))
+    part = run_policy(scenario, Interrupts(200), keep_interrupted=True)
     assert (whole.interrupted, part.interrupted) == (False, True)
     assert part.t_s[-1] == pytest.approx(4.0)
     for name in (*RECORDED, *SIGNALS):
@@ -300,7 +300,7 @@ def test_an_interrupted_record_has_what_was_simulated():
     assert len(part.metrics()) == 3
     part.string()
     with pytest.raises(KeyboardInterrupt):
-        run_policy(scenario, Interrupts(0))
+        run_policy(scenario, Interrupts(0), keep_interrupted=True)
 
 
 def test_ctrl_c_keeps_and_marks_what_was_simulated(monkeypatch, capsys):

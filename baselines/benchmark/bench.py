@@ -17,7 +17,7 @@ from baselines.benchmark.plan import Episode, Plan
 from baselines.benchmark.results import Results
 from baselines.policies.entries import step_statistics
 from baselines.policies.registry import FittedPolicy, fit_policy
-from baselines.runs.jobs import spread
+from baselines.runs.jobs import alone_in, spread
 from baselines.runs.provenance import physics_digest
 from baselines.runs.run import Record, run_policy, run_seeds, seed_blocks
 from tlf_env.common.errors import install_command
@@ -135,28 +135,30 @@ def run_bench(
     Raises
     ------
     ValueError
-        for a plan that cannot run, before anything is run.
+        for a plan that cannot run, or a folder in which another process works, before anything is run.
     """
     if processes < 1:
         raise ValueError(f"processes {processes} must be at least 1")
     need_tables()
     results = Results(folder, plan)
-    begin()
-    todo = results.missing()
-    total = len(plan.episodes())
-    if progress is not None:
-        progress(total - len(todo), total)
-    finished = spread(
-        run_block,
-        plan,
-        blocks(plan, todo),
-        processes=processes,
-        ray_address=ray_address,
-        ahead=IN_FLIGHT_PER_PROCESS,
-    )
-    for lines in finished:
-        for line in lines:
-            results.add(line)
+    with alone_in(folder):
+        results.read()
+        begin()
+        todo = results.missing()
+        total = len(plan.episodes())
         if progress is not None:
-            progress(len(results.lines), total)
+            progress(total - len(todo), total)
+        finished = spread(
+            run_block,
+            plan,
+            blocks(plan, todo),
+            processes=processes,
+            ray_address=ray_address,
+            ahead=IN_FLIGHT_PER_PROCESS,
+        )
+        for lines in finished:
+            for line in lines:
+                results.add(line)
+            if progress is not None:
+                progress(len(results.lines), total)
     return results

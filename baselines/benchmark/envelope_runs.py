@@ -24,7 +24,7 @@ from baselines.benchmark.envelope import (
 )
 from baselines.benchmark.lines import BESIDE, beside
 from baselines.policies.registry import fit_policy, policy_hash
-from baselines.runs.jobs import claim, spread
+from baselines.runs.jobs import alone_in, claim, spread
 from baselines.runs.jsonl import append_line, read_lines
 from baselines.runs.outcome import failed
 from baselines.runs.provenance import git_revision, physics_digest, simulation_digest, versions
@@ -134,7 +134,12 @@ class EnvelopeResults:
         record = plan_record(plan)
         folder.mkdir(parents=True, exist_ok=True)
         claim(folder / PLAN_FILE, record, CLAIMED, "envelopes")
-        self.lines: dict[Probe, dict[str, Any]] = read_lines(folder / LEVELS_FILE, _probe_of)
+        self.lines: dict[Probe, dict[str, Any]] = {}
+        self.read()
+
+    def read(self) -> None:
+        """Read the lines that are in the folder now."""
+        self.lines = read_lines(self.folder / LEVELS_FILE, _probe_of)
 
     def add(self, line: dict[str, Any]) -> None:
         """Append one level; it is on the disk when this returns."""
@@ -201,7 +206,7 @@ def run_envelope(
     Raises
     ------
     ValueError
-        for a plan that cannot run, before anything is run.
+        for a plan that cannot run, or a folder in which another process works, before anything is run.
     """
     if processes < 1:
         raise ValueError(f"processes {processes} must be at least 1")
@@ -211,10 +216,12 @@ def run_envelope(
         if progress is not None:
             progress(len(results.lines), len(results.lines) + results.most_left())
 
-    report()
-    for line in spread(
-        run_probe, plan, _Ready(results), processes=processes, ray_address=ray_address
-    ):
-        results.add(line)
+    with alone_in(folder):
+        results.read()
         report()
+        for line in spread(
+            run_probe, plan, _Ready(results), processes=processes, ray_address=ray_address
+        ):
+            results.add(line)
+            report()
     return results

@@ -70,18 +70,9 @@ def _error(line: Line) -> float:
 
 
 def record_of(plan: Plan, episode: Episode) -> Record:
-    """An episode of a plan, run again by itself and recorded with all its signals.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        if it was interrupted.
-    """
+    """An episode of a plan, run again by itself and recorded with all its signals."""
     fitted = fit_policy(episode.policy, plan.scenario(episode), trust=plan.trust)
-    record = run_policy(fitted.scenario, fitted.policy, episode.seed, name=episode.policy)
-    if record.interrupted:
-        raise KeyboardInterrupt
-    return record
+    return run_policy(fitted.scenario, fitted.policy, episode.seed, name=episode.policy)
 
 
 def differences(record: Record, line: Line) -> list[str]:

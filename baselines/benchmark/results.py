@@ -83,10 +83,12 @@ class Results:
         record = plan_record(plan)
         folder.mkdir(parents=True, exist_ok=True)
         claim(folder / PLAN_FILE, record, CLAIMED, "results")
-        self.lines = self._read()
+        self.lines: dict[Episode, dict[str, Any]] = {}
+        self.read()
 
-    def _read(self) -> dict[Episode, dict[str, Any]]:
-        return read_lines(self.folder / RUNS_FILE, Episode.of_line)
+    def read(self) -> None:
+        """Read the lines that are in the folder now."""
+        self.lines = read_lines(self.folder / RUNS_FILE, Episode.of_line)
 
     def add(self, line: dict[str, Any]) -> None:
         """Append one episode; it is on the disk when this returns."""

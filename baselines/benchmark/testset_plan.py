@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import datetime
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -11,6 +10,7 @@ from typing import Any, ClassVar
 from baselines.benchmark.draws import words_of
 from baselines.benchmark.plan import Episode, Plan
 from baselines.benchmark.testset import NAME, VERSION, case_scenario
+from baselines.runs.jsonl import append_line
 from baselines.runs.provenance import git_revision, simulation_digest, versions
 from baselines.runs.seed_ranges import FIRST_TABLE_SEED, SeedRange
 from tlf_env.common.files import parse_json
@@ -101,8 +101,7 @@ def log_look(plan: TestPlan, folder: Path) -> None:
         "git_revision": git_revision(),
         "versions": versions(),
     }
-    with (folder / LOOKS_FILE).open("a", encoding="utf-8") as file:
-        file.write(json.dumps(look) + "\n")
+    append_line(folder / LOOKS_FILE, look)
 
 
 def looks_of(folder: Path) -> list[dict[str, Any]]:

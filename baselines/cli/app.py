@@ -7,7 +7,7 @@ from typing import Annotated
 
 import typer
 
-BAD_INPUT, FAILED, INTERRUPTED = 2, 1, 130  # exit status
+BAD_INPUT, FAILED = 2, 1  # exit status; of a command that was stopped: baselines.runs.stopping
 
 app = typer.Typer(
     help="Time-gap leader-follower formations of wheeled robots that slip.",

@@ -8,7 +8,7 @@ from typing import Annotated, Any
 
 import typer
 
-from baselines.cli.app import INTERRUPTED, completed
+from baselines.cli.app import completed
 from baselines.cli.options import (
     DISTURBANCE,
     LEVEL,
@@ -29,6 +29,7 @@ from baselines.console import (
     screen,
     writable_folder,
 )
+from baselines.runs.stopping import stopped_status
 
 commands = typer.Typer()
 
@@ -143,7 +144,7 @@ def run(
         trust=trust,
     )
     if not finished:
-        raise SystemExit(INTERRUPTED)
+        raise SystemExit(stopped_status())
 
 
 @commands.command(epilog=examples("compare"))

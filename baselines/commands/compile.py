@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from numba.core.event import Event, Listener, install_listener
 
 from baselines.console import notes, progress_bar, screen
+from baselines.runs.stopping import starting_workers
 from tlf_env.numerics.compiled import cache_folder
 
 
@@ -89,7 +90,8 @@ def in_two_processes(shares: tuple[Share, ...]) -> bool:
         for share in shares:
             answers, to_parent = context.Pipe(duplex=False)
             process = context.Process(target=compile_share, args=(share, to_parent), daemon=True)
-            process.start()
+            with starting_workers():
+                process.start()
             to_parent.close()
             processes.append(process)
             running[answers] = process

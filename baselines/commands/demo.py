@@ -12,7 +12,8 @@ from baselines.commands.run import Wanted, identity_for, write_run
 from baselines.console import progress_bar, screen, warn_of_missing, writable_folder
 from baselines.pages.replay import write_comparison
 from baselines.policies.registry import fit_policy
-from baselines.runs.folders import REPLAY, make_room
+from baselines.runs.folders import REPLAY
+from baselines.runs.jobs import alone_in
 from baselines.runs.run import Record, run_policy
 from tlf_env.task.scenario import load_scenario
 
@@ -56,12 +57,10 @@ def demo_command(seed: int, out: Path, *, figures: bool) -> dict[str, list[Recor
                 chosen = load_scenario(TASK, disturbance=disturbance, horizon_s=HORIZON_S)
                 fitted = fit_policy(entry.policy, chosen)
                 record = run_policy(fitted.scenario, fitted.policy, seed, name=entry.policy)
-                if record.interrupted:
-                    raise KeyboardInterrupt
                 folder = writable_folder(out / f"{entry.policy.replace(':', '_')}-{disturbance}")
                 identity = identity_for(entry.policy, fitted, seed, {})
-                make_room(folder, identity, overwrite=True)
-                write_run(record, folder, identity, wanted)
+                with alone_in(folder):
+                    write_run(record, folder, identity, wanted)
                 runs[disturbance].append(record)
                 update(sum(map(len, runs.values())), total)
     replay = write_comparison(runs["slip"], out / REPLAY, [entry.title for entry in ENTRIES])

@@ -39,11 +39,13 @@ from baselines.runs.files import (
 from baselines.runs.folders import (
     REPLAY,
     Identity,
+    check_room,
     folder_name,
     identity_of,
     is_preset,
-    make_room,
+    replaced,
 )
+from baselines.runs.jobs import alone_in
 from baselines.runs.run import Record, run_policy
 from baselines.runs.video import FPS, Film, check_video, write_video
 from baselines.tables import metrics_table
@@ -102,21 +104,31 @@ def run_command(
     if folder is None:
         folder = RESULTS / folder_name(scenario, identity, _usual(chosen, name, seed, trust))
     writable_folder(folder)
-    make_room(folder, identity, wanted.overwrite)
-    compile_before_first_run()
-    with progress_bar(f"{scenario.name}, {name}") as update:
-        record = run_policy(
-            scenario,
-            fitted.policy,
-            seed,
-            name=name,
-            options=options,
-            progress=update,
-            watch=film,
-        )
-    written = write_run(record, folder, identity, wanted)
+    with alone_in(folder):
+        whole = check_room(folder, identity, wanted.overwrite)
+        compile_before_first_run()
+        with progress_bar(f"{scenario.name}, {name}") as update:
+            record = run_policy(
+                scenario,
+                fitted.policy,
+                seed,
+                name=name,
+                options=options,
+                progress=update,
+                watch=film,
+                keep_interrupted=True,
+            )
+        if record.interrupted and whole:
+            notes.print(
+                f"tlf: interrupted after {record.t_s[-1]:.6g} s of {scenario.horizon_s:g} s; {folder} keeps "
+                "the whole run that it holds. The same command runs it from the start.",
+                soft_wrap=True,
+            )
+            return False
+        written = write_run(record, folder, identity, wanted)
     if wanted.out is None:
-        write_index(RESULTS)
+        with alone_in(RESULTS, wait=True):
+            write_index(RESULTS)
     if film is not None and wanted.video is not None:
         with progress_bar("video") as update:
             write_video([film], wanted.video, progress=update)
@@ -152,16 +164,18 @@ def asked_film(wanted: Wanted) -> Film | None:
 
 
 def write_run(record: Record, folder: Path, identity: Identity, wanted: Wanted) -> list[Path]:
-    """Write all files of a run, the summary last."""
-    written = write_record(record, folder)
-    if wanted.mat:
-        written.append(write_mat(record, folder))
-    if wanted.parquet:
-        written.append(write_parquet(record, folder))
-    written.append(write_replay(record, folder / REPLAY))
-    if wanted.figures:
-        written += draw(record, folder)
-    return [write_summary(record, folder, identity, written), *written]
+    """Write all files of a run, in place of those of an earlier one in the folder."""
+    with replaced(folder) as place:
+        written = write_record(record, place)
+        if wanted.mat:
+            written.append(write_mat(record, place))
+        if wanted.parquet:
+            written.append(write_parquet(record, place))
+        written.append(write_replay(record, place / REPLAY))
+        if wanted.figures:
+            written += draw(record, place)
+        written.insert(0, write_summary(record, place, identity, written))
+    return [folder / path.name for path in written]
 
 
 def draw(record: Record, folder: Path) -> list[Path]:

@@ -83,18 +83,9 @@ def scenario_of(key: Key) -> Scenario:
 
 
 def run(key: Key, progress: Callable[[int, int], None] | None = None) -> Outcome:
-    """Drive a run to its horizon, seed 0, with the paper's filter.
-
-    Raises
-    ------
-    KeyboardInterrupt
-        for a run that was interrupted.
-    """
+    """Drive a run to its horizon, seed 0, with the paper's filter."""
     fitted = fit_policy(f"reference:{key.gains}", scenario_of(key))
-    record = run_policy(fitted.scenario, fitted.policy, 0, progress=progress)
-    if record.interrupted:
-        raise KeyboardInterrupt
-    return outcome(record)
+    return outcome(run_policy(fitted.scenario, fitted.policy, 0, progress=progress))
 
 
 def outcome(record: Record) -> Outcome:

@@ -9,7 +9,7 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from baselines.runs.folders import IDENTITY, SUMMARY, WRITTEN, Identity
+from baselines.runs.folders import IDENTITY, INTERRUPTED, SUMMARY, WRITTEN, Identity
 from baselines.runs.provenance import versions
 from baselines.runs.run import RECORDED, Record
 from baselines.runs.signals import OBSERVATION
@@ -31,7 +31,7 @@ def summary(record: Record) -> dict[str, Any]:
         "privileged": record.scenario.privileged,
         "settle_s": record.scenario.settle_s,
         "simulated_s": float(record.t_s[-1]),
-        "interrupted": record.interrupted,
+        INTERRUPTED: record.interrupted,
         "versions": versions(),
         "string": record.string()._asdict(),
         "robots": {f"robot_{i}": metrics._asdict() for i, metrics in enumerate(record.metrics())},
@@ -121,7 +121,7 @@ def read_record(folder: Path) -> Record:
             columns={name: found.pop(name) for name in RECORDED},
             signals=found,
             options=written["reset_options"],
-            interrupted=bool(written["interrupted"]),
+            interrupted=bool(written[INTERRUPTED]),
             **ends,
         )
     except FileNotFoundError:

@@ -5,7 +5,10 @@ from __future__ import annotations
 import hashlib
 import json
 import re
-from collections.abc import Iterable, Mapping
+import shutil
+import tempfile
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,6 +22,8 @@ INDEX = "index.html"
 REPLAY = "replay.html"
 WRITTEN = "files"  # entry of a summary: the files of its run
 IDENTITY = "identity"  # entry of a summary: what the run depends on
+INTERRUPTED = "interrupted"  # entry of a summary: whether the run ended before its horizon
+UNFINISHED = ".unfinished-"  # begin of the name of a folder for files that are not complete
 # Files that any run may have: left behind by one that was killed before its summary.
 FIGURES = ("overview", "paths", "errors", "functionals", "wheels", "slip", "time_gap")
 RUN_FILES = (
@@ -79,35 +84,63 @@ def is_preset(scenario: Scenario) -> bool:
     )
 
 
-def make_room(folder: Path, identity: Identity, overwrite: bool) -> None:
-    """Remove the files of an earlier run from a folder: of the same run, or of any with ``overwrite``.
-
-    A run that was killed before its summary does not count. Other files stay.
+def check_room(folder: Path, identity: Identity, overwrite: bool) -> bool:
+    """Whether a folder holds a whole run; it may only be the same one, or any with ``overwrite``.
 
     Raises
     ------
     ValueError
         if the folder holds another run, naming what differs.
     """
-    path = folder / SUMMARY
-    if not path.exists():
-        for name in RUN_FILES:
-            (folder / name).unlink(missing_ok=True)
-        return
-    try:
-        before = dict(read_json(path))
-    except (ValueError, TypeError):
-        before = {}
+    if not (folder / SUMMARY).exists():
+        return False
+    before = _read_summary(folder)
     held = before.get(IDENTITY)
     if not overwrite and held != list(identity):
         raise ValueError(
             f"{folder} holds another run ({_difference(held, identity)}); --overwrite replaces it, --out "
             "names another folder"
         )
-    for name in before.get(WRITTEN, []):
-        if isinstance(name, str) and Path(name).name == name:
-            (folder / name).unlink(missing_ok=True)
-    path.unlink(missing_ok=True)
+    return not before.get(INTERRUPTED, True)
+
+
+def _read_summary(folder: Path) -> dict[str, Any]:
+    """The summary in a folder; nothing if it is damaged or missing."""
+    try:
+        return dict(read_json(folder / SUMMARY))
+    except (ValueError, TypeError):
+        return {}
+
+
+def _same(one: Path, other: Path) -> bool:
+    return one.exists() and other.exists() and one.read_bytes() == other.read_bytes()
+
+
+@contextmanager
+def replaced(folder: Path) -> Iterator[Path]:
+    """A hidden folder for the files of a run, which take the place of those of an earlier run at the end.
+
+    Until then the earlier run stays as it is, also if this one is killed. Files that belong to no run stay
+    in any case. The summary comes last: with it the run's folder is complete.
+    """
+    for left in folder.glob(f"{UNFINISHED}*"):  # of a killed run
+        shutil.rmtree(left, ignore_errors=True)
+    with tempfile.TemporaryDirectory(dir=folder, prefix=UNFINISHED) as made:
+        yield Path(made)
+        names = sorted(path.name for path in Path(made).iterdir())
+        earlier = {*RUN_FILES, *map(str, _read_summary(folder).get(WRITTEN, []))} - {
+            *names,
+            SUMMARY,
+        }
+        if not _same(Path(made) / SUMMARY, folder / SUMMARY):
+            (folder / SUMMARY).unlink(
+                missing_ok=True
+            )  # so that it never describes files of another run
+        for name in earlier:
+            if Path(name).name == name:
+                (folder / name).unlink(missing_ok=True)
+        for name in sorted(names, key=SUMMARY.__eq__):
+            (Path(made) / name).replace(folder / name)
 
 
 def _difference(held: Any, identity: Identity) -> str:

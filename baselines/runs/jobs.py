@@ -6,16 +6,16 @@ import fcntl
 import json
 import os
 import socket
-import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
 from itertools import islice
-from multiprocessing import get_context, parent_process
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, TypeVar
 
+from baselines.runs.stopping import starting_workers, stop_with_parent
 from tlf_env.common.errors import install_command, shown
 from tlf_env.common.files import atomic, read_json
 
@@ -45,10 +45,13 @@ def claim(path: Path, record: dict[str, Any], keys: Sequence[str], what: str) ->
         naming what differs first, with both values, or if the file is damaged.
     """
     if not path.exists():
-        with atomic(path, encoding="utf-8") as file:
-            json.dump(record, file, indent=2)
-            file.write("\n")
-        return
+        try:
+            with atomic(path, encoding="utf-8", exclusive=True) as file:
+                json.dump(record, file, indent=2)
+                file.write("\n")
+            return
+        except FileExistsError:  # another process has just claimed it
+            pass
     try:
         before = dict(read_json(path))
     except (ValueError, TypeError) as error:
@@ -76,8 +79,13 @@ def first_difference(there: Any, now: Any, path: str) -> tuple[str, Any, Any]:
 
 
 @contextmanager
-def alone_in(folder: Path) -> Iterator[None]:
+def alone_in(folder: Path, *, wait: bool = False) -> Iterator[None]:
     """Lock a folder against other processes that lock it; a killed process leaves no lock behind.
+
+    Parameters
+    ----------
+    wait
+        Wait until the lock is free.
 
     Raises
     ------
@@ -87,9 +95,11 @@ def alone_in(folder: Path) -> Iterator[None]:
     handle = os.open(folder, os.O_RDONLY)
     try:
         try:
-            fcntl.flock(handle, fcntl.LOCK_EX | fcntl.LOCK_NB)
+            fcntl.flock(handle, fcntl.LOCK_EX | (0 if wait else fcntl.LOCK_NB))
         except BlockingIOError as error:
-            raise ValueError(f"another process works in {folder}") from error
+            raise ValueError(
+                f"another process works in {folder}; wait for it, or choose another --out"
+            ) from error
         yield
     finally:
         os.close(handle)
@@ -108,7 +118,7 @@ def spread(
     """Answers ``function(shared, job)`` as they arrive: from here, from processes, or from a Ray cluster.
 
     A job is drawn only when a process is free for it. So a generator of jobs may use the answers so
-    far, and an interrupt is quick.
+    far. After an interrupt, or an error, the processes stop at once; trainings write their checkpoints before.
 
     Parameters
     ----------
@@ -139,35 +149,37 @@ def _in_processes(
     ahead: int,
     meanwhile: Callable[[], None],
 ) -> Iterator[AnswerT]:
+    context = get_context("spawn")
+    watched, ends = zip(context.Pipe(duplex=False), context.Pipe(duplex=False), strict=True)
     pool = ProcessPoolExecutor(
-        processes, mp_context=get_context("spawn"), initializer=_end_with_parent
+        processes, mp_context=context, initializer=stop_with_parent, initargs=watched
     )
+    stop, leave = ends
     waiting = iter(jobs)
     running: set[Future[AnswerT]] = set()
     try:
         while True:
             for job in islice(waiting, processes * ahead - len(running)):
-                running.add(pool.submit(function, shared, job))
+                with starting_workers():
+                    running.add(pool.submit(function, shared, job))
             if not running:
                 return
             done, running = wait(running, POLLED_EVERY_S, return_when=FIRST_COMPLETED)
             meanwhile()
             for future in done:
                 yield future.result()
+    except BaseException:
+        stop.close()
+        raise
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _end_with_parent() -> None:
-    """End this worker when its parent is killed; a pool alone does not do that."""
-    parent = parent_process()
-
-    def wait_and_leave() -> None:
-        if parent is not None:
-            parent.join()
-            os._exit(1)
-
-    threading.Thread(target=wait_and_leave, daemon=True).start()
+        try:
+            pool.shutdown(wait=True, cancel_futures=True)
+        except KeyboardInterrupt:  # a second one
+            leave.close()
+            raise
+        finally:
+            for one in (*watched, *ends):
+                one.close()
 
 
 def _on_ray(

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, TypeVar
 
-from tlf_env.common.files import atomic, parse_json
+from tlf_env.common.files import naming, parse_json
 
 KeyT = TypeVar("KeyT")
 
@@ -16,7 +16,8 @@ KeyT = TypeVar("KeyT")
 def read_lines(path: Path, key: Callable[[dict[str, Any]], KeyT]) -> dict[KeyT, dict[str, Any]]:
     """The lines of a JSONL file by their keys; none without a file.
 
-    Complete lines only: a half-written last line of a killed process is removed from the file.
+    Complete lines only: what a killed process has left of its last line is not read;
+    :func:`append_line` cuts it off.
 
     Raises
     ------
@@ -27,9 +28,6 @@ def read_lines(path: Path, key: Callable[[dict[str, Any]], KeyT]) -> dict[KeyT, 
         return {}
     data = path.read_bytes()
     whole = data[: data.rfind(b"\n") + 1]
-    if len(whole) < len(data):
-        with atomic(path, "wb") as file:
-            file.write(whole)
     lines: dict[KeyT, dict[str, Any]] = {}
     for number, text in enumerate(whole.splitlines(), start=1):
         try:
@@ -41,11 +39,38 @@ def read_lines(path: Path, key: Callable[[dict[str, Any]], KeyT]) -> dict[KeyT, 
 
 
 def append_line(path: Path, line: dict[str, Any]) -> None:
-    """Append one line to a JSONL file; it is on the disk when this returns."""
-    text = json.dumps(line, allow_nan=False) + "\n"
-    handle = os.open(path, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o644)
-    try:
-        os.write(handle, text.encode())
-        os.fsync(handle)
-    finally:
-        os.close(handle)
+    """Append one line to a JSONL file; it is on the disk when this returns.
+
+    What a killed process has left of a line is cut off before. If the line cannot be written as a whole (a
+    full disk may take a part of it without an error), nothing of it stays.
+
+    Raises
+    ------
+    OSError
+        that names the file.
+    """
+    data = (json.dumps(line, allow_nan=False) + "\n").encode()
+    with naming(path):
+        handle = os.open(path, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o644)
+        try:
+            end = _end_of_whole_lines(handle)
+            try:
+                left = memoryview(data)
+                while left:
+                    left = left[os.write(handle, left) :]
+                os.fsync(handle)
+            except OSError:
+                os.ftruncate(handle, end)
+                raise
+        finally:
+            os.close(handle)
+
+
+def _end_of_whole_lines(handle: int) -> int:
+    """Cut what follows the last newline of a file; returns the file's size then."""
+    size = end = os.fstat(handle).st_size
+    while end and os.pread(handle, 1, end - 1) != b"\n":
+        end -= 1
+    if end < size:
+        os.ftruncate(handle, end)
+    return end

@@ -138,10 +138,9 @@ def run_policy(
     options: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Formation], None] | None = None,
+    keep_interrupted: bool = False,
 ) -> Record:
     """Run a policy over the whole horizon, without early ends (``end_on=()``), and record everything.
-
-    A ``KeyboardInterrupt`` (Ctrl-C) ends the run; the record has what was simulated, and is marked.
 
     Parameters
     ----------
@@ -154,6 +153,9 @@ def run_policy(
     watch
         Called with the formation at the start and after every control step; it must only read, for example
         keep scenes for a video (:class:`baselines.runs.video.Film`).
+    keep_interrupted
+        After an interrupt (Ctrl-C) return a record of what was simulated, marked as interrupted, once there
+        is a step; without it the interrupt goes on, so that a part is never taken for the whole.
 
     Raises
     ------
@@ -183,7 +185,7 @@ def run_policy(
             if progress is not None:
                 progress(k, steps)
     except KeyboardInterrupt:
-        if not done:
+        if not (keep_interrupted and done):
             raise
     plain = {name: np.asarray(value).tolist() for name, value in (options or {}).items()} or None
     return replace(

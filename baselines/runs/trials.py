@@ -2,8 +2,12 @@
 
 from __future__ import annotations
 
+import errno
+import os
+import sqlite3
 import warnings
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +16,15 @@ import numpy as np
 from tlf_env.common.errors import install_command
 
 STUDY_FILE = "study.db"
+# What a database that cannot be written answers, as errors of the system.
+SQLITE_ERRORS = {
+    sqlite3.SQLITE_FULL: errno.ENOSPC,
+    sqlite3.SQLITE_READONLY: errno.EROFS,
+    sqlite3.SQLITE_CANTOPEN: errno.EACCES,
+    sqlite3.SQLITE_IOERR: errno.EIO,
+    sqlite3.SQLITE_BUSY: errno.EBUSY,
+}
+PRIMARY = 0xFF  # mask of the part of a code of SQLite that names the kind of error
 CHOSEN = "choose_{}"  # attribute of the study for each finalist
 
 
@@ -36,7 +49,9 @@ class TrialStore:
     Raises
     ------
     ValueError
-        if optuna is missing, or the database cannot be read.
+        if optuna is missing, or the database is damaged.
+    OSError
+        if the database cannot be written, as of every method that stores something.
     """
 
     def __init__(
@@ -50,21 +65,33 @@ class TrialStore:
     ) -> None:
         optuna = optuna_package()
         from sqlalchemy import URL
-        from sqlalchemy.exc import SQLAlchemyError
 
+        self._path = folder / STUDY_FILE
         self._distributions = dict(distributions)
         self._sampler_seed, self._startup_trials = sampler_seed, startup_trials
-        url = URL.create("sqlite", database=str((folder / STUDY_FILE).absolute()))
-        try:
+        url = URL.create("sqlite", database=str(self._path.absolute()))
+        with self._stored():
             self.study = optuna.create_study(
                 storage=url.render_as_string(hide_password=False),
                 study_name=name,
                 load_if_exists=True,
             )
             self.study.get_trials()
+
+    @contextmanager
+    def _stored(self) -> Iterator[None]:
+        """Report what the database cannot do as an error of the system, or that it is damaged."""
+        from sqlalchemy.exc import SQLAlchemyError
+
+        optuna = optuna_package()
+        try:
+            yield
         except (SQLAlchemyError, RuntimeError, optuna.exceptions.OptunaError) as error:
+            number = SQLITE_ERRORS.get(_sqlite_code(error))
+            if number is not None:
+                raise OSError(number, os.strerror(number), str(self._path)) from error
             raise ValueError(
-                f"{folder / STUDY_FILE} cannot be read; choose another --out, or remove {folder}"
+                f"{self._path} cannot be read; choose another --out, or remove {self._path.parent}"
             ) from error
 
     def trials(self, *states: str) -> list[Any]:
@@ -80,13 +107,13 @@ class TrialStore:
         """The next trial, stored as running; the first has the values of the start."""
         optuna = optuna_package()
         known = self.trials()
-        self.study.add_trial(
-            optuna.trial.create_trial(
-                state=optuna.trial.TrialState.RUNNING,
-                params=self._proposal(known) if known else dict(start),
-                distributions=self._distributions,
-            )
+        trial = optuna.trial.create_trial(
+            state=optuna.trial.TrialState.RUNNING,
+            params=self._proposal(known) if known else dict(start),
+            distributions=self._distributions,
         )
+        with self._stored():
+            self.study.add_trial(trial)
         return self.trials()[-1]
 
     def _proposal(self, known: list[Any]) -> dict[str, Any]:
@@ -115,13 +142,14 @@ class TrialStore:
         """
         optuna = optuna_package()
         handle = optuna.trial.Trial(self.study, self.trials()[number]._trial_id)
-        for name, value in notes.items():
-            handle.set_user_attr(name, value)
-        if stopped_at is None:
-            self.study.tell(number, score)
-        else:  # Optuna takes the last intermediate value of a pruned trial
-            handle.report(score, stopped_at)
-            self.study.tell(number, state=optuna.trial.TrialState.PRUNED)
+        with self._stored():
+            for name, value in notes.items():
+                handle.set_user_attr(name, value)
+            if stopped_at is None:
+                self.study.tell(number, score)
+            else:  # Optuna takes the last intermediate value of a pruned trial
+                handle.report(score, stopped_at)
+                self.study.tell(number, state=optuna.trial.TrialState.PRUNED)
 
     def finalists(self, count: int) -> list[int]:
         """Numbers of the completed trials with the smallest scores, and of the start (trial 0)."""
@@ -137,7 +165,18 @@ class TrialStore:
 
     def choose(self, number: int, outcome: Mapping[str, Any]) -> None:
         """Store the outcome of a finalist on the seeds that choose."""
-        self.study.set_user_attr(CHOSEN.format(number), dict(outcome))
+        with self._stored():
+            self.study.set_user_attr(CHOSEN.format(number), dict(outcome))
+
+
+def _sqlite_code(error: BaseException | None) -> int:
+    """The primary code of the error of SQLite beneath an error; 0 if there is none."""
+    while error is not None:
+        code = getattr(error, "sqlite_errorcode", None)
+        if code is not None:
+            return int(code) & PRIMARY
+        error = getattr(error, "orig", None) or error.__cause__ or error.__context__
+    return 0
 
 
 def optuna_package() -> Any:

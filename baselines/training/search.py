@@ -280,34 +280,49 @@ def run_search(
     KeyboardInterrupt
         after an interrupt, once the trainings have written their checkpoints.
     """
-    found = TrainingSearch(config, folder)
-    threads = 1
-    update = progress or (lambda done, total: None)
+    search_of(config)
+    folder.mkdir(parents=True, exist_ok=True)
+    with alone_in(folder):
+        return _search(
+            TrainingSearch(config, folder),
+            processes,
+            ray_address,
+            command,
+            progress or (lambda done, total: None),
+            finished or (lambda outcome, values: None),
+        )
 
+
+def _search(
+    found: TrainingSearch,
+    processes: int,
+    ray_address: str | None,
+    command: str,
+    update: Callable[[int, int], None],
+    finished: Callable[[Trained, dict[str, Any]], None],
+) -> dict[str, Any]:
     def outcomes(jobs: Iterable[TrialJob]) -> Iterator[Trained]:
-        shared = Shared(config, folder, threads)
+        shared = Shared(found.config, found.folder, threads=1)
         for outcome in spread(
             run_trial, shared, jobs, processes=processes, ray_address=ray_address
         ):
-            if finished is not None:
-                finished(outcome, found.values(outcome.number))
+            finished(outcome, found.values(outcome.number))
             yield outcome
 
-    with alone_in(folder):
-        done = len(found.store.trials("COMPLETE", "PRUNED"))
-        total = max(found.search.trials, done) + found.search.finalists + 1
+    done = len(found.store.trials("COMPLETE", "PRUNED"))
+    total = max(found.search.trials, done) + found.search.finalists + 1
+    update(done, total)
+    for outcome in outcomes(found.jobs()):
+        found.tell(outcome)
+        done += 1
         update(done, total)
-        for outcome in outcomes(found.jobs()):
-            found.tell(outcome)
-            done += 1
-            update(done, total)
-        chosen = found.chosen()
-        left = [number for number in found.finalists() if number not in chosen]
-        for outcome in outcomes(_final(found, number) for number in left):
-            found.choose(outcome)
-            chosen[outcome.number] = outcome
-            update(done + len(chosen), done + len(found.finalists()))
-        return _write(found, chosen, command)
+    chosen = found.chosen()
+    left = [number for number in found.finalists() if number not in chosen]
+    for outcome in outcomes(_final(found, number) for number in left):
+        found.choose(outcome)
+        chosen[outcome.number] = outcome
+        update(done + len(chosen), done + len(found.finalists()))
+    return _write(found, chosen, command)
 
 
 def _final(found: TrainingSearch, number: int) -> TrialJob:

@@ -10,12 +10,9 @@ seeds; ``policy.safetensors`` holds the best one so far. ``curve.json`` records 
 from __future__ import annotations
 
 import math
-import signal
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from pathlib import Path
-from types import FrameType
 from typing import Any
 
 import torch
@@ -23,6 +20,7 @@ from stable_baselines3.common.logger import Logger, TensorBoardOutputFormat
 
 from baselines.runs.jobs import alone_in, claim
 from baselines.runs.provenance import simulation_digest
+from baselines.runs.stopping import interrupts
 from baselines.sb3 import FormationVecEnv
 from baselines.training.checkpoint import read_checkpoint, write_checkpoint
 from baselines.training.config import TrainConfig
@@ -61,7 +59,7 @@ def train(
 ) -> dict[str, Any]:
     """Train with one seed, from the folder's checkpoint if there is one, and keep the best policy.
 
-    After an interrupt (SIGINT) the current rollout and its update are finished and a checkpoint is
+    After an interrupt (SIGINT or SIGTERM) the current rollout and its update are finished and a checkpoint is
     written. The next call continues to the same result, bit for bit, as an uninterrupted training.
 
     Parameters
@@ -270,27 +268,3 @@ def tensorboard(folder: Path) -> list[Any]:
         return [TensorBoardOutputFormat(str(folder))]
     except AssertionError:
         return []
-
-
-@contextmanager
-def interrupts() -> Iterator[list[int]]:
-    """A list that is not empty once an interrupt was received; a second interrupt ends at once.
-
-    Outside the main thread, where no signal can be handled, it stays empty.
-    """
-    came: list[int] = []
-
-    def handle(number: int, frame: FrameType | None) -> None:
-        if came:
-            raise KeyboardInterrupt
-        came.append(number)
-
-    try:
-        before = signal.signal(signal.SIGINT, handle)
-    except ValueError:
-        yield came
-        return
-    try:
-        yield came
-    finally:
-        signal.signal(signal.SIGINT, before)

@@ -109,7 +109,7 @@ def _train_one(
     folder = shared.folder / f"seed_{seed}"
 
     def progress(done: int, total: int) -> None:
-        with atomic(folder / STEPS_FILE) as file:
+        with atomic(folder / STEPS_FILE, durable=False) as file:
             file.write(f"{done}\n")
         report()
 

@@ -18,7 +18,7 @@ from baselines.runs.provenance import git_revision, simulation_digest, versions
 from baselines.runs.trials import optuna_package
 from baselines.tuning.config import TuneConfig
 from baselines.tuning.start import LawStart
-from baselines.tuning.study import StoredStudy
+from baselines.tuning.study import StoredStudy, search_record
 from baselines.tuning.trial import Outcome, TrialJob, run_trial
 from tlf_env.common.files import atomic
 from tlf_env.common.presets import yaml_text
@@ -57,8 +57,10 @@ def run_tune(
     """
     if workers < 1:
         raise ValueError(f"workers {workers} must be at least 1")
-    study = StoredStudy(config, folder)
+    record = search_record(config)
+    folder.mkdir(parents=True, exist_ok=True)
     with alone_in(folder):
+        study = StoredStudy(config, folder, record)
         chosen = _search(study, workers, ray_address, progress or (lambda done, total: None))
         result = _result(study, chosen, command)
         use = use_of(config)

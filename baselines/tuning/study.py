@@ -17,6 +17,31 @@ from tlf_env.task.neutral import scenario_hash
 SEARCH_FILE = "search.json"
 STUDY_NAME = "tune"
 SCORES = "scores"  # attribute of a trial
+NOT_CLAIMED = ("versions", "git_revision")  # entries of search.json that may change
+
+
+def search_record(config: TuneConfig) -> dict[str, Any]:
+    """The content of ``search.json``. Every scenario is made.
+
+    Raises
+    ------
+    ValueError
+        if optuna is missing, or a scenario is not valid.
+    """
+    optuna_package()
+    asked = config.model_dump(mode="json")
+    del asked["trials"]  # a larger number continues the search
+    scenarios = {
+        place: scenario_hash(scenario)
+        for place, scenario in config.scenarios(config.ekf_slip).items()
+    }
+    return {
+        **asked,
+        "scenarios": scenarios,
+        "simulation": simulation_digest(),
+        "versions": versions(),
+        "git_revision": git_revision(),
+    }
 
 
 class StoredStudy:
@@ -33,19 +58,14 @@ class StoredStudy:
         simulation, or its database cannot be read.
     """
 
-    def __init__(self, config: TuneConfig, folder: Path) -> None:
+    def __init__(
+        self, config: TuneConfig, folder: Path, record: dict[str, Any] | None = None
+    ) -> None:
         self.config = config
         optuna = optuna_package()
-        asked = config.model_dump(mode="json")
-        del asked["trials"]  # a larger number continues the search
-        scenarios = {
-            place: scenario_hash(scenario)
-            for place, scenario in config.scenarios(config.ekf_slip).items()
-        }
-        record = {**asked, "scenarios": scenarios, "simulation": simulation_digest()}
+        record = record or search_record(config)
         folder.mkdir(parents=True, exist_ok=True)
-        keys = tuple(record)
-        record |= {"versions": versions(), "git_revision": git_revision()}
+        keys = tuple(key for key in record if key not in NOT_CLAIMED)
         claim(folder / SEARCH_FILE, record, keys, "a search")
         self.store = TrialStore(
             folder,

@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import re
-import tempfile
+import secrets
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -13,22 +14,102 @@ from typing import IO, Any
 
 from tlf_env.common.errors import RepeatedKeyError, path_text
 
+# Answers of file systems without files that have no name, and of kernels that know none.
+NO_UNNAMED = (errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL, errno.ENOENT)
 FILE_NAME = re.compile(r"\w[\w.+-]{0,99}")  # a name that can be a file's or a folder's
 
 
 @contextmanager
-def atomic(path: Path, mode: str = "w", **options: Any) -> Iterator[IO[Any]]:
-    """Open a file for writing; it appears under its name only when it is complete."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+def atomic(
+    path: Path, mode: str = "w", *, exclusive: bool = False, durable: bool = True, **options: Any
+) -> Iterator[IO[Any]]:
+    """Open a file for writing; it appears under its name only when it is complete.
+
+    Where the system has files without a name (Linux, on most file systems) a killed writer leaves nothing
+    behind; elsewhere it leaves a hidden file.
+
+    Parameters
+    ----------
+    exclusive
+        Write no file where there is one: of several writers at once the first one's file stays.
+    durable
+        Wait until the content is on the disk, so that a power cut leaves the old file or the new one.
+
+    Raises
+    ------
+    OSError
+        that names the file, for a full disk or a folder that cannot be written.
+    FileExistsError
+        if it is exclusive, and there is such a file.
+    """
+    temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}"
+    with naming(path):
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle = _unnamed(path.parent)
+        unnamed = handle is not None
+        if handle is None:
+            handle = os.open(temporary, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
+        try:
+            with os.fdopen(handle, mode, **options) as file:
+                yield file
+                file.flush()
+                os.fchmod(handle, 0o644)
+                if durable:
+                    os.fsync(handle)
+                if unnamed:
+                    try:
+                        _name(handle, path)
+                        return
+                    except FileExistsError:
+                        if exclusive:
+                            raise
+                    _name(handle, temporary)
+            if exclusive:
+                os.link(temporary, path)
+                temporary.unlink()
+            else:
+                temporary.replace(path)
+        except BaseException:
+            temporary.unlink(missing_ok=True)
+            raise
+
+
+@contextmanager
+def naming(path: Path) -> Iterator[None]:
+    """Let an error of the system in this block name the file that was written."""
     try:
-        with os.fdopen(handle, mode, **options) as file:
-            yield file
-        Path(temporary).chmod(0o644)
-        Path(temporary).replace(path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
+        yield
+    except OSError as error:
+        if error.errno is None or (error.filename is not None and not _is_temporary(error, path)):
+            raise
+        raise type(error)(error.errno, error.strerror, str(path)) from error
+
+
+def _is_temporary(error: OSError, path: Path) -> bool:
+    """Whether an error names what only :func:`atomic` knows: a hidden file, or the folder itself."""
+    named = str(error.filename)
+    return named == str(path.parent) or Path(named).name.startswith(f".{path.name}.")
+
+
+def _unnamed(folder: Path) -> int | None:
+    """A new file in a folder, without a name; None where there are no such files."""
+    if not (hasattr(os, "O_TMPFILE") and Path("/proc/self/fd").is_dir()):
+        return None
+    try:
+        return os.open(folder, os.O_TMPFILE | os.O_WRONLY, 0o600)
+    except OSError as error:
+        if error.errno in NO_UNNAMED:
+            return None
         raise
+
+
+def _name(handle: int, path: Path) -> None:
+    """Give a file without a name its name, which must be free."""
+    folder = os.open(path.parent, os.O_RDONLY)
+    try:  # with a folder Python calls linkat, which follows the link to the file
+        os.link(f"/proc/self/fd/{handle}", path.name, dst_dir_fd=folder, follow_symlinks=True)
+    finally:
+        os.close(folder)
 
 
 def parse_json(text: str | bytes) -> Any:

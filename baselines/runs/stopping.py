@@ -1,0 +1,127 @@
+"""Being asked to stop: SIGTERM like Ctrl-C, and workers that stop with the command that started them."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from multiprocessing import parent_process, resource_tracker
+from multiprocessing.connection import Connection, wait
+from types import FrameType
+from typing import Any
+
+INTERRUPTED, TERMINATED = 130, 143  # exit status after SIGINT and after SIGTERM: 128 + the signal
+
+_terminated: list[int] = []
+
+
+class Interrupted(KeyboardInterrupt):
+    """SIGINT or SIGTERM.
+
+    Python itself ends a process by SIGINT, whatever status it asks for, once a plain ``KeyboardInterrupt`` has
+    passed a call of ``exec``, as many modules have where they are imported.
+    """
+
+
+@contextmanager
+def interruptible() -> Iterator[None]:
+    """Let SIGTERM end a command as Ctrl-C does: either raises :class:`Interrupted`.
+
+    A handler other than Python's own is left alone, and so is a signal that is ignored.
+    """
+
+    def interrupt(number: int, frame: FrameType | None) -> None:
+        if number == signal.SIGTERM:
+            _terminated.append(number)
+        raise Interrupted
+
+    _terminated.clear()
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
+    taken = {number: how for number, how in usual.items() if signal.getsignal(number) is how}
+    try:
+        for number in taken:
+            signal.signal(number, interrupt)
+        yield
+    finally:
+        for number, how in taken.items():
+            signal.signal(number, how)
+
+
+def stopped_status() -> int:
+    """The exit status of a command that was interrupted."""
+    return TERMINATED if _terminated else INTERRUPTED
+
+
+@contextmanager
+def starting_workers() -> Iterator[None]:
+    """A process that is started in this block sees no SIGINT from its beginning; this one gets it afterwards.
+
+    Ctrl-C reaches a worker, too, while it is still importing its modules, and would end it with a traceback.
+    """
+    resource_tracker.ensure_running()  # it is started with the first process, and unblocks SIGINT
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+def stop_with_parent(stop: Connection, leave: Connection) -> None:
+    """Let this worker end with its parent; the initializer of a pool of processes.
+
+    Ctrl-C is left to the parent, which a terminal interrupts, too. When the parent closes its end of ``stop``
+    the worker gets a SIGTERM, which ends it at once, or a training at its next checkpoint
+    (:func:`interrupts`). When it closes its end of ``leave``, or is killed, the worker ends at once.
+    """
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    parent = parent_process()
+    assert parent is not None
+
+    def watch() -> None:
+        at_once: list[Any] = [parent.sentinel, leave]
+        ready = wait([*at_once, stop])
+        if not any(one in ready for one in at_once):
+            os.kill(os.getpid(), signal.SIGTERM)
+            wait(at_once)
+        os._exit(1)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+@contextmanager
+def interrupts() -> Iterator[list[int]]:
+    """A list that is not empty once SIGINT or SIGTERM was received; a second one ends at once.
+
+    A worker ends after the block if it was asked to stop in it; it counts no second signal, as the pool
+    of processes may send one. Outside the main thread, where no signal can be handled, the list stays empty.
+    """
+    came: list[int] = []
+    worker = parent_process() is not None
+
+    def handle(number: int, frame: FrameType | None) -> None:
+        if came and not worker:
+            raise Interrupted
+        if number == signal.SIGTERM:
+            _terminated.append(number)
+        came.append(number)
+
+    if threading.current_thread() is not threading.main_thread():
+        yield came
+        return
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
+    handled = [number for number, how in before.items() if how is not signal.SIG_IGN]
+    try:
+        for number in handled:
+            signal.signal(number, handle)
+        yield came
+    finally:
+        for number in handled:
+            signal.signal(number, before[number])
+        if worker and came:
+            signal.raise_signal(came[0])
