@@ -101,9 +101,20 @@ class FormationTask(Task):
         return FormationTaskClass
 
     def get_from_yaml(self, path: str | None = None) -> TaskClass:
-        """The task with the arguments in a YAML file; the shipped one if ``path`` is None."""
+        """The task with the arguments in a YAML file; the shipped one if ``path`` is None.
+
+        Raises
+        ------
+        ValueError
+            for the argument ``trust``: a file must not permit itself to run code.
+        """
         shipped = presets_folder() / "benchmarl" / f"{self.name.lower()}.yaml"
-        return super().get_from_yaml(str(path or shipped))
+        task = super().get_from_yaml(str(path or shipped))
+        if "trust" in task.config:
+            raise ValueError(
+                f"{path}: trust must be left out; set it in Python: task.config['trust'] = True"
+            )
+        return task
 
 
 def _entries(env: EnvBase, key: str) -> Composite:

@@ -57,6 +57,8 @@ class FormationBatchEnv(EnvBase):
         The keys of the infos, True for all, False for none.
     device
         Of the tensors; the simulation runs on the CPU.
+    trust
+        As in :class:`~tlf_env.engine.batch.BatchPlant`.
     **overrides
         Fields of the scenario. ``action`` is by default that of the other learners' environments.
 
@@ -78,13 +80,14 @@ class FormationBatchEnv(EnvBase):
         seed: int | None = None,
         infos: InfoChoice = False,
         device: Any = "cpu",
+        trust: bool = False,
         **overrides: Any,
     ) -> None:
         self._info_keys = chosen_keys(infos)
         super().__init__(device=device, batch_size=(checked_count("formations", formations),))
         overrides = learners_action(scenario, overrides)
         self.plant = BatchPlant(
-            scenario, formations, threads=threads, staggered=staggered, **overrides
+            scenario, formations, threads=threads, staggered=staggered, trust=trust, **overrides
         )
         self._first_seed = seed
         self._make_specs()

@@ -78,7 +78,9 @@ def record_of(plan: Plan, episode: Episode) -> Record:
         if it was interrupted.
     """
     fitted = fit_policy(episode.policy, plan.scenario(episode), trust=plan.trust)
-    record = run_policy(fitted.scenario, fitted.policy, episode.seed, name=episode.policy)
+    record = run_policy(
+        fitted.scenario, fitted.policy, episode.seed, name=episode.policy, trust=plan.trust
+    )
     if record.interrupted:
         raise KeyboardInterrupt
     return record

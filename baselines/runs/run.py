@@ -138,6 +138,7 @@ def run_policy(
     options: Mapping[str, Any] | None = None,
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Formation], None] | None = None,
+    trust: bool = False,
 ) -> Record:
     """Run a policy over the whole horizon, without early ends (``end_on=()``), and record everything.
 
@@ -154,6 +155,9 @@ def run_policy(
     watch
         Called with the formation at the start and after every control step; it must only read, for example
         keep scenes for a video (:class:`baselines.runs.video.Film`).
+    trust
+        Whether code that the scenario names (``"module:factory"``) may be imported. Objects need no
+        permission.
 
     Raises
     ------
@@ -161,7 +165,7 @@ def run_policy(
         for an unknown or invalid option; naming the policy, if its ``predict`` does not return a pair of
         actions (in the right shape) and a state; naming part and factory, for a part that cannot be made.
     """
-    formation = Formation(scenario.model_copy(update={"end_on": ()}), parts)
+    formation = Formation(scenario.model_copy(update={"end_on": ()}), parts, trust=trust)
     formation.reset(checked_seed(seed), start=start_options(options, scenario.robot_count))
     a, steps = formation.arrays, scenario.horizon_steps
     tape, signals = _Tape(a, steps), SignalTape(a, scenario)
@@ -202,6 +206,7 @@ def run_seeds(
     *,
     name: str = "policy",
     most_failed: int | None = None,
+    trust: bool = False,
 ) -> Iterator[Record]:
     """Runs of several seeds side by side, without contact between robots; as :func:`run_policy`.
 
@@ -212,9 +217,11 @@ def run_seeds(
     ----------
     most_failed
         Stop, with no record at all, as soon as robots are lost or touch in more runs than this.
+    trust
+        As of :func:`run_policy`.
     """
     with without_warnings():
-        plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds))
+        plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds), trust=trust)
     plant.reset(list(seeds))
     a, steps = plant.arrays, scenario.horizon_steps
     tape = _Tape(a, steps)
@@ -225,7 +232,7 @@ def run_seeds(
         if len(seeds) == 1:
             raise
         for seed in seeds:
-            yield from run_seeds(scenario, policy, [seed], name=name)
+            yield from run_seeds(scenario, policy, [seed], name=name, trust=trust)
         return
     for k in range(1, steps + 1):
         plant.step(actions)

@@ -63,6 +63,9 @@ class BatchPlant:
         How many work on a step; None takes one for each core.
     mixture
         True, or a share for each scenario: every episode of a formation draws its scenario, by its seed.
+    trust
+        Whether a policy that ``residual_base`` names (``"module:factory"``) may be imported; a policy that is
+        given as an object needs no permission.
     staggered
         Whether a reset of all formations spreads the ends of their episodes: that of formation k ends
         after (k + 1)/formations of the horizon, the later ones at the horizon. For learners: otherwise
@@ -87,6 +90,7 @@ class BatchPlant:
         threads: int | None = 1,
         mixture: bool | Sequence[float] = False,
         staggered: bool = False,
+        trust: bool = False,
         **overrides: Any,
     ) -> None:
         if not isinstance(scenario, Sequence) or isinstance(scenario, str):
@@ -102,7 +106,7 @@ class BatchPlant:
         self.threads = checked_count("threads", os.cpu_count() or 1 if threads is None else threads)
         table = reference_table(self.scenario)
         self.arrays: Arrays = make_arrays(self.scenarios, table, self.formations)
-        self._base = make_base(self.scenario, base)
+        self._base = make_base(self.scenario, base, trust=trust)
         self._variants = make_variants(self.scenarios, _shares(mixture, len(self.scenarios)))
         each = [make_settings(one) for one in self.scenarios]
         self._settings = each[0]._replace(changing=any(one.changing for one in each))
