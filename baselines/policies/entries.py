@@ -14,7 +14,7 @@ from baselines.policies.learned import LearnedPolicy, load_policy
 from baselines.policies.systems import ENTRY
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen
-from tlf_env.common.presets import read_yaml
+from tlf_env.common.presets import check_named_files, read_yaml
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS
 from tlf_env.onboard.limiters import Limiter
@@ -101,8 +101,10 @@ def load_entry(folder: Path) -> EntryCard:
     path = folder / ENTRY_FILE
     if not path.is_file():
         raise ValueError(f"entry {str(folder)!r} has no file {ENTRY_FILE}")
+    data = read_yaml(path)
+    check_named_files(path, data)
     try:
-        return EntryCard.model_validate(read_yaml(path))
+        return EntryCard.model_validate(data)
     except ValidationError as error:
         raise ValueError(f"{path}: {one_line(error, EntryCard)}") from error
 
