@@ -165,6 +165,17 @@ def test_a_card_does_not_name_a_base_elsewhere(name, folders):
         read_policy(folders / "own.safetensors")
 
 
+@pytest.mark.parametrize("name", ["../secret", "/etc/passwd"])
+def test_the_suffix_of_a_path_does_not_matter_where_a_file_must_be(name, folders):
+    for content, read in (
+        ({"trajectory": {"type": "waypoints", "file": name}}, load_scenario),
+        ({"imitation": {"data": name}}, load_config),
+    ):
+        (folders / "own.yaml").write_text(yaml.safe_dump(content))
+        with pytest.raises(ValueError, match=f"names {name}, which lies neither"):
+            read(folders / "own.yaml")
+
+
 def test_what_lies_beside_a_file_or_where_we_work_is_read(folders):
     (folders / "path.yaml").write_text(yaml.safe_dump({"trajectory": CIRCLE}))
     (folders.parent / "work" / "other.yaml").write_text("level: 1.0")

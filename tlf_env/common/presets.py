@@ -45,6 +45,7 @@ DECIMAL = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
 
 # Ends of the files that a file may name, and what separates their names in one text.
 NAMED_SUFFIXES = (*SUFFIXES, ".csv", ".json", ".parquet", ".safetensors", ".zip", ".npz")
+NAMES_A_FILE = ("file", "data")  # keys of waypoints, and of the data of a training
 MOST_NAMED = 300  # characters of a name in an error
 BETWEEN_NAMES = re.compile(r"[,;:+@]")
 
@@ -271,7 +272,7 @@ def check_named_files(path: Path, data: Any) -> None:
         The file.
     data
         Plain data. A text, or what is between commas, colons, ``+`` and ``@`` in it, names a file if it ends as
-        one.
+        one, and always as the value of a key in :data:`NAMES_A_FILE`.
 
     Raises
     ------
@@ -279,10 +280,10 @@ def check_named_files(path: Path, data: Any) -> None:
         in one line that names the file, and what it names.
     """
     folders = [path.resolve().parent, Path.cwd()]
-    for text in _texts(data):
+    for text, is_file in _texts(data):
         for named in {text, *BETWEEN_NAMES.split(text)}:
             name = named.strip()
-            if not name.lower().endswith(NAMED_SUFFIXES):
+            if not (is_file or name.lower().endswith(NAMED_SUFFIXES)):
                 continue
             for start in folders:
                 try:
@@ -300,17 +301,17 @@ def check_named_files(path: Path, data: Any) -> None:
                     )
 
 
-def _texts(data: Any) -> Iterator[str]:
-    """All texts in plain data, keys included."""
+def _texts(data: Any, is_file: bool = False) -> Iterator[tuple[str, bool]]:
+    """All texts in plain data, keys included, and whether each is the value of a key of a file."""
     if isinstance(data, str):
-        yield data
+        yield data, is_file
     elif isinstance(data, dict):
         for key, value in data.items():
             yield from _texts(key)
-            yield from _texts(value)
+            yield from _texts(value, key in NAMES_A_FILE)
     elif isinstance(data, list | tuple):
         for one in data:
-            yield from _texts(one)
+            yield from _texts(one, is_file)
 
 
 def read_preset_or_file(kind: str, source: str | Path, others: str = "") -> dict[str, Any]:
