@@ -8,12 +8,13 @@ from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+from pydantic import ValidationError
 
 from baselines.runs.folders import IDENTITY, SUMMARY, WRITTEN, Identity
 from baselines.runs.provenance import versions
 from baselines.runs.run import RECORDED, Record
 from baselines.runs.signals import OBSERVATION
-from tlf_env.common.errors import install_command
+from tlf_env.common.errors import install_command, one_line
 from tlf_env.common.files import atomic, read_json
 from tlf_env.task.scenario import Scenario
 
@@ -126,6 +127,9 @@ def read_record(folder: Path) -> Record:
         )
     except FileNotFoundError:
         raise ValueError(f"{folder} holds no run: there is no {TRAJECTORY} in it") from None
+    except ValidationError as error:
+        why = one_line(error, Scenario)
+        raise ValueError(f"{folder}: a file of the run is broken: scenario.{why}") from None
     except (KeyError, TypeError) as error:
         raise ValueError(
             f"{folder}: {error} is missing or wrong; run it again with this version"

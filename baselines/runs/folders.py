@@ -104,7 +104,8 @@ def make_room(folder: Path, identity: Identity, overwrite: bool) -> None:
             f"{folder} holds another run ({_difference(held, identity)}); --overwrite replaces it, --out "
             "names another folder"
         )
-    for name in before.get(WRITTEN, []):
+    written = before.get(WRITTEN)
+    for name in written if isinstance(written, list) else []:
         if isinstance(name, str) and Path(name).name == name:
             (folder / name).unlink(missing_ok=True)
     path.unlink(missing_ok=True)
