@@ -166,6 +166,19 @@ def test_a_speed_limit_needs_a_path_with_length():
         retimed(np.zeros((5, 2)), 100.0)
 
 
+def test_a_path_that_is_too_long_is_refused(tmp_path):
+    """Its points every 5 mm, or every 0.1 s, would not fit into the memory."""
+    log = read_log(log_file(tmp_path, "t,x_m,y_m\n0,0,0\n1,4e6,0\n2,4e6,4e6\n1e8,0,0\n"))
+    with pytest.raises(
+        ValueError, match=r"the path is 1\.\d+e\+10 mm long; at most 1e\+07 mm can be timed"
+    ):
+        retimed(log.xy_mm, 400.0)
+    with pytest.raises(
+        ValueError, match=r"the path takes 1e\+08 s; at most 200000 s can be smoothed"
+    ):
+        smoothed(log, 5.0)
+
+
 def tlf(monkeypatch, *words: str) -> None:
     monkeypatch.setattr("sys.argv", ["tlf", *words])
     cli.main()

@@ -20,6 +20,7 @@ from safetensors.numpy import save
 import tlf_env
 from tlf_env.common.errors import path_text, shown
 from tlf_env.common.files import atomic, parse_json
+from tlf_env.common.models import LARGEST
 from tlf_env.engine.arrays import FROM_SCENARIO, Arrays
 from tlf_env.numerics.compiled import simulation_digest
 from tlf_env.onboard.memory import packed, unpacked
@@ -163,13 +164,13 @@ class Snapshot:
         layout
             Their names, dtypes and shapes.
         undefined
-            Names of those that may hold numbers that are not finite.
+            Names of those that may hold NaN.
 
         Raises
         ------
         ValueError
             in one line, for an array that is missing or of another dtype or shape, or for a number that is
-            not finite.
+            not finite, or so large that no episode has it.
         """
         found = {}
         for key, (dtype, shape) in layout.items():
@@ -183,8 +184,12 @@ class Snapshot:
             if array.ndim != len(shape) or any(n is not None and m != n for m, n in sizes):
                 wanted = tuple("any" if n is None else n for n in shape)
                 raise ValueError(f"{what} has the shape {array.shape}, not {wanted}")
-            if array.dtype.kind == "f" and key not in undefined and not np.isfinite(array).all():
-                raise ValueError(f"{what} has a number that is not finite")
+            if array.dtype.kind == "f":
+                known = array[~np.isnan(array)] if key in undefined else array
+                if not np.isfinite(known).all():
+                    raise ValueError(f"{what} has a number that is not finite")
+                if (np.abs(known) > LARGEST).any():
+                    raise ValueError(f"{what} has a number beyond ±{LARGEST:g}")
             found[key] = array
         return found
 
