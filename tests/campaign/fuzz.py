@@ -99,7 +99,7 @@ def searched(
 
     done, rounds = 0, 0
     while done < cases:
-        found: list[Finding] = []
+        found: dict[str, Finding] = {}  # by signature; the last one of each is the smallest
 
         @seeded(seed + 7919 * rounds)
         @settings(
@@ -118,15 +118,19 @@ def searched(
             begun(plain)
             one = tried(target, plain)
             if one is not None and one.signature not in known:
-                found[:] = [one]
-                raise AssertionError
+                found[one.signature] = one
+                # Hypothesis takes errors of one type for the same, and would minimise one into another.
+                raise type(one.signature, (AssertionError,), {})
 
         before = done
-        with suppress(AssertionError):
+        try:
             attempt()
-        if found:
-            known.add(found[0].signature)
-            yield found[0]
+        except Exception as error:  # also Hypothesis's own: a case that fails only sometimes
+            if not found:
+                what = f"{type(error).__name__} of Hypothesis"
+                found[what] = Finding(target, what, str(error)[:2000], None)
+        known.update(found)
+        yield from found.values()
         rounds += 1
         if done == before:  # the target has no more cases than these
             break

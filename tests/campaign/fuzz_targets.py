@@ -1035,9 +1035,8 @@ def snapshots(case: Any) -> None:
             array[place % array.size] = value
     changed_ = Snapshot(taken.kind, taken._fits, taken._memory, numbers)
     try:
-        if refused(lambda: thing.set_state(changed_)) is REFUSED:
-            return
-        for _ in range(2):
+        went = refused(lambda: thing.set_state(changed_)) is not REFUSED
+        for _ in range(2 * went):
             if of_batch:
                 if (thing.arrays.clock[:, 1] >= thing.arrays.clock[:, 3]).any():
                     break
@@ -1048,8 +1047,10 @@ def snapshots(case: Any) -> None:
                 seen, rewards, *_ = thing.step({agent: [0.1, 0.0] for agent in thing.agents})
                 finite("observations after a snapshot", list(seen.values()), OBSERVATION_LIMIT)
                 finite("rewards after a snapshot", list(rewards.values()))
-    finally:
         thing.set_state(taken)
+    except BaseException:
+        (batch_moment if of_batch else moment).cache_clear()  # it may be left half changed
+        raise
 
 
 @functools.cache

@@ -422,7 +422,9 @@ class BatchPlant:
         if len(shares) and (shares[-1] != 1.0 or shares[0] < 0.0 or (np.diff(shares) < 0.0).any()):
             raise ValueError("the snapshot is damaged: its shares of the scenarios do not sum to 1")
         counts = len(self.scenarios), len(phases_s)
-        found = checked_arrays(state, self.arrays, self.scenario, counts)
+        found = checked_arrays(
+            state, self.arrays, self._variants, self.scenario, counts, more["seeded"]
+        )
         if self._base is not None:
             self._base.set_state(state.tree("base"), state.numbers)
         self._follow_from(phases_s)

@@ -242,7 +242,7 @@ class Formation:
         arrays, phase_s = self.arrays, state.tree("phase_s")
         if not isinstance(phase_s, float):
             raise ValueError(f"the snapshot is damaged: its phase is {shown(phase_s)}")
-        found = checked_arrays(state, arrays, self.scenario, (1, 1))
+        found = checked_arrays(state, arrays, self._variants, self.scenario, (1, 1), ALONE)
         space = state.part("space", self.plant.state_layout())
         try:
             self.plant.check_state(space)
