@@ -40,14 +40,14 @@ STALL_LIMIT_S = (
     120.0  # without a new case, after which a process is killed: compiled code that hangs
 )
 MOST_MEMORY = 3 * 2**30  # bytes that a process may take: more is a finding, a MemoryError
-BATCH = 2000  # cases in one process
+BATCH = 500  # cases in one process
 
 
 class Finding(NamedTuple):
     """What a case has shown that is not allowed."""
 
     target: str
-    signature: str  # equal for findings with the same cause, as far as can be told
+    signature: str  # equal for findings that probably have the same cause
     message: str
     case: Any
 

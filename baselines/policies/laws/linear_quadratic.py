@@ -14,7 +14,7 @@ from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
-MOST_STEPS = 1000  # of the recursion, for each action
+MOST_STEPS = 100_000  # of the recursion, for each action
 # The recursion divides by the squares of the tolerances: much smaller or larger ones are lost in rounding.
 Tolerance = Annotated[Positive, Field(ge=1e-5, le=1e6)]
 
