@@ -79,6 +79,7 @@ FOUND: dict[str, tuple[str, Callable[[], Any]]] = {
     ),
     "a run with an infinite seed": ("results", lambda: {**run_files()[0], "seed": math.inf}),
     "a run with odd options": ("results", lambda: {**run_files()[0], "reset_options": 3}),
+    "a setting with a control character": ("settings", lambda: ["name=@\r"]),
     "arrays of texts": ("result_arrays", lambda: [0, "text"]),
 }
 
