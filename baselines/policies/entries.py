@@ -102,7 +102,7 @@ def load_entry(folder: Path) -> EntryCard:
     if not path.is_file():
         raise ValueError(f"entry {str(folder)!r} has no file {ENTRY_FILE}")
     data = read_yaml(path)
-    check_named_files(path, data)
+    check_named_files(path, data.get("scenario"))
     try:
         return EntryCard.model_validate(data)
     except ValidationError as error:
