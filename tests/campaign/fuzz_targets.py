@@ -1355,7 +1355,8 @@ def adversaries(case: Any) -> None:
     env, given = attacked()
     env.reset(seed=0)
     values = real(case)
-    if isinstance(case, list) and all(isinstance(one, list) and len(one) == 2 for one in case):
+    pairs = isinstance(case, list) and all(isinstance(one, list) and len(one) == 2 for one in case)
+    if pairs and all(type(which) is int and type(share) is float for which, share in case):
         values = {}
         for which, share in case:
             channel = CHANNELS[which % len(CHANNELS)]
