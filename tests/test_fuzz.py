@@ -18,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from baselines.benchmark.plan import parse_seeds, parse_sweep
 from baselines.data.files import read_rows
 
 sys.path.insert(0, str(Path(__file__).resolve().parent / "campaign"))
@@ -80,6 +81,8 @@ FOUND: dict[str, tuple[str, Callable[[], Any]]] = {
     "a run with an infinite seed": ("results", lambda: {**run_files()[0], "seed": math.inf}),
     "a run with odd options": ("results", lambda: {**run_files()[0], "reset_options": 3}),
     "a setting with a control character": ("settings", lambda: ["name=@\r"]),
+    "an entry's folder with a long name": ("policy_names_", lambda: "entry:" + 2000 * "x"),
+    "a system with a long name": ("policy_names_", lambda: "reference:+" + 2000 * "x"),
     "arrays of texts": ("result_arrays", lambda: [0, "text"]),
 }
 
@@ -89,6 +92,20 @@ def test_what_was_found_is_mended(what):
     target, case = FOUND[what]
     found = fuzz.tried(target, encoded(case()))
     assert found is None, found.message
+
+
+def test_a_sweep_has_a_limit():
+    """Its values are made at once: a billion of them took minutes and all memory."""
+    with pytest.raises(ValueError, match="with COUNT from 2 to 10000"):
+        parse_sweep("level=0:1:999999999")
+    assert len(parse_sweep("level=0:1:10000")[1]) == 10_000
+
+
+def test_seeds_have_a_limit():
+    """Their episodes are listed before the first is run."""
+    with pytest.raises(ValueError, match="are more than 1000000, the most of a plan"):
+        parse_seeds("0:1000000000000")
+    assert parse_seeds("0:1000000") == (0, 1_000_000)
 
 
 def test_a_damaged_data_set_is_refused_in_one_line(tmp_path):

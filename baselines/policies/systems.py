@@ -13,7 +13,7 @@ import numpy as np
 from baselines.policies.laws.catalogue import LAWS, law_names, make_law
 from baselines.policies.laws.law import Law
 from baselines.policies.reference import ReferencePolicy
-from tlf_env.common.errors import suggestion
+from tlf_env.common.errors import shown, suggestion
 from tlf_env.common.presets import is_file_name, preset_names, preset_or_file
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.controllers import controller_for, controller_names
@@ -255,6 +255,6 @@ def _unknown(name: str, part: str, given: str, allowed: Iterable[str]) -> ValueE
     """The error for an unknown part of a system."""
     names = list(allowed)
     return ValueError(
-        f"system {name!r}: {part} {given!r} is not one of {', '.join(names)}{suggestion(given, names)}"
-        f"; a system is {FORM}"
+        f"system {shown(name)}: {part} {shown(given)} is not one of {', '.join(names)}"
+        f"{suggestion(given, names)}; a system is {FORM}"
     )
