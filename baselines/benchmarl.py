@@ -8,6 +8,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 from benchmarl.environments import Task, TaskClass
@@ -15,7 +16,7 @@ from torchrl.data import Composite
 from torchrl.envs import EnvBase, PettingZooWrapper
 
 from baselines.torchrl import FormationBatchEnv
-from tlf_env.common.presets import presets_folder
+from tlf_env.common.presets import check_named_files, presets_folder
 from tlf_env.envs.parallel import parallel_env
 
 
@@ -101,9 +102,21 @@ class FormationTask(Task):
         return FormationTaskClass
 
     def get_from_yaml(self, path: str | None = None) -> TaskClass:
-        """The task with the arguments in a YAML file; the shipped one if ``path`` is None."""
+        """The task with the arguments in a YAML file; the shipped one if ``path`` is None.
+
+        Raises
+        ------
+        ValueError
+            for the argument ``trust``, as a file must not permit itself to run code, and for a file elsewhere.
+        """
         shipped = presets_folder() / "benchmarl" / f"{self.name.lower()}.yaml"
-        return super().get_from_yaml(str(path or shipped))
+        task = super().get_from_yaml(str(path or shipped))
+        check_named_files(Path(path or shipped), dict(task.config))
+        if "trust" in task.config:
+            raise ValueError(
+                f"{path}: trust must be left out; set it in Python: task.config['trust'] = True"
+            )
+        return task
 
 
 def _entries(env: EnvBase, key: str) -> Composite:

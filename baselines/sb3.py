@@ -68,6 +68,8 @@ class FormationVecEnv(VecEnv):
         last step of an episode also contains ``terminal_observation``, ``TimeLimit.truncated`` and
         ``episode``: its return ``r``, its length ``l`` and the time ``t`` (s) since the environment was
         made, which SB3 averages as ``ep_rew_mean`` and ``ep_len_mean``.
+    trust
+        As in :class:`~tlf_env.engine.batch.BatchPlant`.
     **overrides
         Fields of the scenarios, and ``disturbance_level``. ``action`` is by default that of
         :class:`~tlf_env.envs.single.FormationEnv`.
@@ -91,6 +93,7 @@ class FormationVecEnv(VecEnv):
         threads: int | None = 1,
         seed: int | None = None,
         infos: InfoChoice = CHEAP_INFOS,
+        trust: bool = False,
         **overrides: Any,
     ) -> None:
         tasks = _tasks(scenario)
@@ -110,6 +113,7 @@ class FormationVecEnv(VecEnv):
                 mixture=mixture,
                 staggered=staggered,
                 precision=precision,
+                trust=trust,
                 **overrides,
             )
             for task, share in zip(tasks, shares, strict=True)

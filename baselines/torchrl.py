@@ -57,6 +57,8 @@ class FormationBatchEnv(EnvBase):
         The keys of the infos, True for all, False for none.
     device
         Of the tensors; the simulation runs on the CPU.
+    trust
+        As in :class:`~tlf_env.engine.batch.BatchPlant`.
     **overrides
         Fields of the scenario. ``action`` is by default that of the other learners' environments.
 
@@ -79,6 +81,7 @@ class FormationBatchEnv(EnvBase):
         seed: int | None = None,
         infos: InfoChoice = False,
         device: Any = "cpu",
+        trust: bool = False,
         **overrides: Any,
     ) -> None:
         self._info_keys = chosen_keys(infos)
@@ -90,6 +93,7 @@ class FormationBatchEnv(EnvBase):
             threads=threads,
             staggered=staggered,
             precision=precision,
+            trust=trust,
             **overrides,
         )
         if TIME_GAP_KEY not in self._info_keys:

@@ -4,7 +4,7 @@ It shows the estimator protocol (``factory(robot, period_s)``, ``reset``, ``upda
 filter with the paper's EKF on the same random draws. The filter runs on every robot, every millisecond.
 
     python examples/custom_estimator.py --horizon-s 100
-    tlf run infinity --estimator examples.custom_estimator:ComplementaryFilter
+    tlf run infinity --estimator examples.custom_estimator:ComplementaryFilter --trust
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def main(horizon_s: float = 100.0, seed: int = 0) -> None:
         scenario = load_scenario(
             "infinity", estimator=estimator, broadcast_smoothing_s=0.0, horizon_s=horizon_s
         )
-        record = run_policy(scenario, ReferencePolicy("consistent"), seed)
+        record = run_policy(scenario, ReferencePolicy("consistent"), seed, trust=True)
         errors = [f"{robot.position_rmse_mm:.2f}" for robot in record.metrics()]
         print(f"{estimator}: position error {', '.join(errors)} mm RMS")
 

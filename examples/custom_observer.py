@@ -6,7 +6,7 @@ shows the observer protocol (``factory(robot, period_s)``, ``reset``, ``update``
 the position noise of the predecessor; the paper's observer filters it.
 
     python examples/custom_observer.py --horizon-s 100
-    tlf run infinity --observer examples.custom_observer:DelayLine
+    tlf run infinity --observer examples.custom_observer:DelayLine --trust
 """
 
 from __future__ import annotations
@@ -58,7 +58,7 @@ def main(horizon_s: float = 100.0, seed: int = 0) -> None:
             broadcast_smoothing_s=0.0,
             horizon_s=horizon_s,
         )
-        robots = run_policy(scenario, ReferencePolicy("consistent"), seed).metrics()
+        robots = run_policy(scenario, ReferencePolicy("consistent"), seed, trust=True).metrics()
         errors = [f"{robot.position_rmse_mm:.2f}" for robot in robots]
         print(f"{name:10s}: position error {', '.join(errors)} mm RMS")
 

@@ -4,7 +4,7 @@ It shows the wheel loop protocol (``factory(robot, period_s)``, ``reset``, ``tor
 loop with the paper's AVC. The loop runs on every robot, every millisecond.
 
     python examples/custom_wheel_loop.py --horizon-s 100
-    tlf run infinity --wheel-loop examples.custom_wheel_loop:PiLoop
+    tlf run infinity --wheel-loop examples.custom_wheel_loop:PiLoop --trust
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ def main(horizon_s: float = 100.0, seed: int = 0) -> None:
     """Run the ∞ with the AVC and with the loop above."""
     for name, wheel_loop in (("AVC", None), ("PI", f"{__name__}:PiLoop")):
         scenario = load_scenario("infinity", wheel_loop=wheel_loop, horizon_s=horizon_s)
-        robots = run_policy(scenario, ReferencePolicy(), seed).metrics()
+        robots = run_policy(scenario, ReferencePolicy(), seed, trust=True).metrics()
         errors = [f"{robot.position_rmse_mm:.2f}" for robot in robots]
         limited = [f"{100 * robot.saturation_fraction:.1f}" for robot in robots]
         print(

@@ -6,7 +6,7 @@ and returns pose, twist, slip and covariance; controllers cancel the slip, and t
 It is compared with the built-in filters on the same random draws, with a fix every 1 ms and every 10 ms.
 
     python examples/ukf_estimator.py --disturbance slip-ramps
-    tlf run infinity --disturbance slip-noise --gains tuned --estimator examples.ukf_estimator:SlipUkf
+    tlf run infinity --disturbance slip-noise --gains tuned --estimator examples.ukf_estimator:SlipUkf --trust
 """
 
 from __future__ import annotations
@@ -180,6 +180,7 @@ def drive(
         start_ramp_s=4.0,
         horizon_s=horizon_s,
         end_on=(),
+        trust=True,
     )
     policy, rows = ReferencePolicy(gains), []
     seen, _ = env.reset(seed=seed)

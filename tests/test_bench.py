@@ -236,7 +236,9 @@ def test_a_policy_whose_file_changed_is_refused(tmp_path, monkeypatch):
         "        return np.zeros((len(seen), 2)), state\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    plan = Plan(("changing:Still",), ("infinity",), ("nominal",), (0, 1), overrides=SHORT)
+    plan = Plan(
+        ("changing:Still",), ("infinity",), ("nominal",), (0, 1), overrides=SHORT, trust=True
+    )
     run_bench(plan, tmp_path / "out")
     with (tmp_path / "changing.py").open("a") as file:
         file.write("# a comment\n")
@@ -426,7 +428,9 @@ def test_an_error_in_a_worker_is_not_swallowed(tmp_path, monkeypatch):
         "        raise ValueError('no idea')\n"
     )
     monkeypatch.syspath_prepend(tmp_path)
-    plan = Plan(("breaking:Breaking",), ("infinity",), ("nominal",), (0, 3), overrides=SHORT)
+    plan = Plan(
+        ("breaking:Breaking",), ("infinity",), ("nominal",), (0, 3), overrides=SHORT, trust=True
+    )
     with pytest.raises(ValueError, match="no idea"):
         run_bench(plan, tmp_path / "out", processes=2)
 

@@ -282,6 +282,16 @@ def test_torchrl_is_refused_what_the_batch_refuses() -> None:
 # BenchMARL
 
 
+def test_a_file_of_benchmarl_cannot_permit_itself_to_run_code(tmp_path: Path) -> None:
+    needed("benchmarl.algorithms")
+    from baselines.benchmarl import FormationTask
+
+    path = tmp_path / "own.yaml"
+    path.write_text("scenario: infinity\nestimator: nasty:Never\ntrust: true\n")
+    with pytest.raises(ValueError, match=r"own\.yaml: trust must be left out"):
+        FormationTask.INFINITY.get_from_yaml(str(path))
+
+
 @pytest.mark.parametrize("algorithm", ["Ippo", "Mappo"])
 @pytest.mark.parametrize("task", ["INFINITY", "FLOWER"])
 def test_benchmarl_trains_a_task(algorithm: str, task: str, tmp_path: Path) -> None:

@@ -171,7 +171,7 @@ assert gentle.controller.gains.k_3_mm2 == ReferencePolicy("consistent").controll
 scenario = tlf_env.load_scenario(
     "ellipse", horizon_s=2.0, estimator="dead_reckoning:DeadReckoning", disturbance="none"
 )
-record = run_policy(scenario, gentle)
+record = run_policy(scenario, gentle, trust=True)
 assert np.isfinite(record["x_mm"]).all() and record["x_mm"].any()
 print("done")
 """

@@ -228,7 +228,7 @@ def test_an_unknown_learner_is_named(learner: Any) -> None:
 )
 def test_impossible_others_are_named(others: Any, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        FormationEnv(others=others)
+        FormationEnv(others=others, trust=True)
 
 
 # Steps
@@ -368,7 +368,7 @@ def test_the_reference_among_others_is_the_reference_policy_bitwise(
 def test_others_by_name_are_the_same_as_the_object_and_the_built_in_reference() -> None:
     runs = []
     for others in ("reference", "baselines:ReferencePolicy", ReferencePolicy()):
-        env = FormationEnv(learner="robot_2", others=others)
+        env = FormationEnv(learner="robot_2", others=others, trust=True)
         env.reset(seed=1)
         runs.append(list(steps_of(env, random_actions(env, 60))))
     assert runs[0] == runs[1] == runs[2]

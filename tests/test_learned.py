@@ -504,20 +504,23 @@ def asking(tmp_path, monkeypatch):
 
 @pytest.mark.usefixtures("asking")
 def test_a_custom_policy_may_ask_for_fields():
-    assert fit_policy("asking:Asking", TWIST).scenario is TWIST
-    fitted = fit_policy("asking:Sensing", TWIST)
+    assert fit_policy("asking:Asking", TWIST, trust=True).scenario is TWIST
+    fitted = fit_policy("asking:Sensing", TWIST, trust=True)
     assert (fitted.scenario.observation, fitted.scenario.action) == ("sensor", "residual")
     assert fitted.overrides["preview_s"] == []
-    assert fit_policy("asking:Sensing", load_scenario(action="twist")).scenario.action == "twist"
+    assert (
+        fit_policy("asking:Sensing", load_scenario(action="twist"), trust=True).scenario.action
+        == "twist"
+    )
     with pytest.raises(
         ValueError,
         match="must map fields of action, action_range, tracking_fade_mm, limiter, observation",
     ):
-        fit_policy("asking:Greedy", TWIST)
+        fit_policy("asking:Greedy", TWIST, trust=True)
     with pytest.raises(
         ValueError, match="policy 'asking:Odd' asks for an invalid scenario: action: "
     ):
-        fit_policy("asking:Odd", TWIST)
+        fit_policy("asking:Odd", TWIST, trust=True)
 
 
 def test_a_policy_with_another_action_gets_the_same_draws(tmp_path):

@@ -197,7 +197,7 @@ def test_a_wrong_answer_is_named_and_nothing_moves(answer, why):
 def test_what_is_no_policy_is_refused(base, why):
     for make in (tlf_env.parallel_env, lambda *a, **f: BatchPlant(*a, 2, **f)):
         with pytest.raises(ValueError, match=why):
-            make("infinity", residual_base=base, **ON)
+            make("infinity", residual_base=base, trust=True, **ON)
 
 
 def test_a_path_is_a_controllers_file(tmp_path):
@@ -209,7 +209,9 @@ def test_a_path_is_a_controllers_file(tmp_path):
 
 
 def test_a_name_is_imported_by_every_door():
-    env = tlf_env.parallel_env("infinity", residual_base="baselines:ReferencePolicy", **ON)
+    env = tlf_env.parallel_env(
+        "infinity", residual_base="baselines:ReferencePolicy", trust=True, **ON
+    )
     assert env.scenario.outside_base == "baselines:ReferencePolicy"
     env.reset(seed=0)
     env.step({agent: np.zeros(2) for agent in env.agents})

@@ -107,6 +107,23 @@ def test_what_cannot_be_read_is_told_by_its_place(content, options, words, tmp_p
     assert words in said(log_file(tmp_path, content), **options)
 
 
+@pytest.mark.parametrize(
+    ("content", "options", "words"),
+    [
+        ("log\nt;x;y\n0,0;0,0;0,0\n0,1;0,1;0,0\n0,2;0,2;0,1\n", {"columns": "1,2,3"}, "'t' in column 1 is no"),
+        ("t,x_mm,y_mm\n0,0,0\n1,11e99950,0\n", {}, "line 3: '11e99950' in column 2 must be within ±1e+20"),
+        ("t,x_mm,y_mm\n0,0,0\n9e999999999,1,0\n", {}, "line 3: '9e999999999' in column 1 must be within"),
+        ("t,x_mm,y_mm\n0,0,0\n1,-1e19,0\n", {}, "line 3: x and y must be within ±1e+10 mm, got -1e+19, 0"),
+        ("t,x_mm,y_mm\n0,0,0\n1,200,0\n1.00000000000000000001,9,0\n", {}, "line 4: its time"),
+        ("a," * 3000 + "b\n0,0,0\n1,1,0\n", {}, "no column for time in the header a, a, "),
+    ],
+)  # fmt: skip
+def test_hostile_numbers_and_headers_are_refused(content, options, words, tmp_path):
+    text = said(log_file(tmp_path, content), **options)
+    assert words in text
+    assert len(text) < 600
+
+
 def test_a_log_that_is_too_long_is_thinned(tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(path_module, "MAX_POINTS", 50)
     monkeypatch.chdir(tmp_path)
@@ -164,6 +181,19 @@ def test_retiming_keeps_to_its_limits():
 def test_a_speed_limit_needs_a_path_with_length():
     with pytest.raises(ValueError, match="the path has no length"):
         retimed(np.zeros((5, 2)), 100.0)
+
+
+def test_a_path_that_is_too_long_is_refused(tmp_path):
+    """Its points every 5 mm, or every 0.1 s, would not fit into the memory."""
+    log = read_log(log_file(tmp_path, "t,x_m,y_m\n0,0,0\n1,4e6,0\n2,4e6,4e6\n1e8,0,0\n"))
+    with pytest.raises(
+        ValueError, match=r"the path is 1\.\d+e\+10 mm long; at most 1e\+07 mm can be timed"
+    ):
+        retimed(log.xy_mm, 400.0)
+    with pytest.raises(
+        ValueError, match=r"the path takes 1e\+08 s; at most 200000 s can be smoothed"
+    ):
+        smoothed(log, 5.0)
 
 
 def tlf(monkeypatch, *words: str) -> None:

@@ -29,6 +29,13 @@ class Elements(html.parser.HTMLParser):
             self.inside.setdefault(self.found[-1][0], []).append(data)
 
 
+def test_halves_of_surrogate_pairs_are_replaced():
+    """JSON and the names of files may have them; UTF-8 has not."""
+    assert text("a\ud800<b") == "a?&lt;b"
+    source = page("\ud800", "<p></p>", data={"\udfff": "\ud800"})
+    assert source.encode("utf-8").count(b"?") == 3
+
+
 def test_any_text_stays_text():
     source = page(
         HOSTILE, f'<p title="{text(HOSTILE)}">{text(HOSTILE)}</p>', data={"name": HOSTILE}

@@ -213,7 +213,7 @@ def test_an_observer_looks_ahead_as_far_as_the_preview(period_s: float) -> None:
 def test_a_class_and_its_name_agree_bitwise(role: str) -> None:
     part = PAPERS_PARTS[role]
     by_class = tlf_env.parallel_env("infinity", **{role: part})
-    by_name = tlf_env.parallel_env("infinity", **{role: f"{HERE}:{part.__name__}"})
+    by_name = tlf_env.parallel_env("infinity", trust=True, **{role: f"{HERE}:{part.__name__}"})
     assert by_class.scenario == by_name.scenario
     np.testing.assert_array_equal(drive(by_class, 0.5), drive(by_name, 0.5))
 
@@ -235,7 +235,7 @@ def test_modules_beside_the_working_directory_are_found(
 ) -> None:
     (tmp_path / "my_parts_here.py").write_text(f"from {HERE} import PaperEkf as Mine\n")
     monkeypatch.chdir(tmp_path)
-    env = tlf_env.parallel_env("infinity", estimator="my_parts_here:Mine")
+    env = tlf_env.parallel_env("infinity", estimator="my_parts_here:Mine", trust=True)
     expected = drive(tlf_env.parallel_env("infinity", estimator=PaperEkf), 0.1)
     np.testing.assert_array_equal(drive(env, 0.1), expected)
 
@@ -247,13 +247,15 @@ def test_a_scenario_file_names_parts(tmp_path: Path) -> None:
         "rate_x_rad_s: 0.125, rate_y_rad_s: 0.25, centre_x_mm: 2500, centre_y_mm: 2500}\n"
         f"wheel_loop: {HERE}:PaperWheelLoop\n"
     )
-    env = tlf_env.parallel_env(path)
+    env = tlf_env.parallel_env(path, trust=True)
     assert env.scenario.wheel_loop == f"{HERE}:PaperWheelLoop"
     assert np.isfinite(drive(env, 0.1)).all()
 
 
 def test_gymnasium_takes_parts_too() -> None:
-    env = gymnasium.make("tlf_env/Infinity-v0", action="residual", estimator=f"{HERE}:PaperEkf")
+    env = gymnasium.make(
+        "tlf_env/Infinity-v0", action="residual", estimator=f"{HERE}:PaperEkf", trust=True
+    )
     env.reset(seed=0)
     for _ in range(10):
         *_, info = env.step(np.zeros(2, np.float32))
@@ -382,7 +384,7 @@ def test_an_impossible_answer_is_named_with_robot_and_part(
 )
 def test_a_part_that_is_not_there_is_named(role: str, path: str, message: str) -> None:
     with pytest.raises(ValueError, match=message):
-        tlf_env.parallel_env("infinity", **{role: path})
+        tlf_env.parallel_env("infinity", trust=True, **{role: path})
 
 
 BROKEN = {
@@ -401,7 +403,7 @@ def test_a_module_that_cannot_be_imported_is_told_in_one_line(
     monkeypatch.chdir(tmp_path)
     line = rf"^cannot import '{module}' of '{module}:Part': {message}[^\n]*$"
     with pytest.raises(ValueError, match=line):
-        tlf_env.parallel_env("infinity", estimator=f"{module}:Part")
+        tlf_env.parallel_env("infinity", estimator=f"{module}:Part", trust=True)
     assert str(tmp_path) not in sys.path
 
 
@@ -439,7 +441,7 @@ WANTED = {
 @pytest.mark.parametrize("role", METHODS)
 @pytest.mark.parametrize("path", ["os:getcwd", "builtins:dict", f"{HERE}:Keyworded", "json:loads"])
 def test_a_factory_that_does_not_take_robot_and_period_is_named(role: str, path: str) -> None:
-    env = tlf_env.parallel_env("infinity", **{role: path})
+    env = tlf_env.parallel_env("infinity", trust=True, **{role: path})
     wanted = rf"^{role} '{path}' cannot be made by factory\(robot, period_s\): [^\n]+$"
     with pytest.raises(ValueError, match=wanted):
         env.reset(seed=0)
@@ -448,7 +450,7 @@ def test_a_factory_that_does_not_take_robot_and_period_is_named(role: str, path:
 @pytest.mark.parametrize("role", METHODS)
 @pytest.mark.parametrize("part", ["NoReset", "given_a_class"])
 def test_a_part_without_a_method_is_named_with_what_it_needs(role: str, part: str) -> None:
-    env = tlf_env.parallel_env("infinity", **{role: f"{HERE}:{part}"})
+    env = tlf_env.parallel_env("infinity", trust=True, **{role: f"{HERE}:{part}"})
     with pytest.raises(ValueError, match=rf"^{role} '{HERE}:{part}' .*{WANTED[role]}$"):
         env.reset(seed=0)
 

@@ -266,7 +266,7 @@ def test_a_policy_that_does_not_fit_is_reported(name, fields):
 
 @pytest.mark.usefixtures("own_module")
 def test_a_policy_may_come_from_a_custom_factory():
-    policy = make_policy("own_policies:Still", SCENARIO)
+    policy = make_policy("own_policies:Still", SCENARIO, trust=True)
     record = run_policy(SCENARIO, policy)
     assert np.abs(np.diff(record["x_mm"], axis=0)).max() < 1e-6
 
@@ -274,9 +274,9 @@ def test_a_policy_may_come_from_a_custom_factory():
 @pytest.mark.usefixtures("own_module")
 def test_a_custom_policy_must_predict_actions_of_the_right_shape():
     with pytest.raises(ValueError, match=r"has no predict\(\)"):
-        make_policy("own_policies:nothing", SCENARIO)
+        make_policy("own_policies:nothing", SCENARIO, trust=True)
     with pytest.raises(ValueError, match=r"must have the shape \(3, 2\), got \(3, 3\)"):
-        run_policy(SCENARIO, make_policy("own_policies:Odd", SCENARIO))
+        run_policy(SCENARIO, make_policy("own_policies:Odd", SCENARIO, trust=True))
 
 
 @pytest.mark.usefixtures("own_module")
@@ -290,7 +290,7 @@ def test_a_custom_policy_must_predict_actions_of_the_right_shape():
 )
 def test_a_factory_that_makes_no_policy_is_reported_in_one_line(name, message):
     with pytest.raises(ValueError, match=rf"^policy 'own_policies:{name}'[^\n]*{message}"):
-        make_policy(f"own_policies:{name}", SCENARIO)
+        make_policy(f"own_policies:{name}", SCENARIO, trust=True)
 
 
 PREDICTS = {
@@ -307,7 +307,7 @@ PREDICTS = {
 def test_a_prediction_that_is_not_a_pair_of_actions_and_state_is_reported(name, message):
     """With two robots: two rows of actions alone could pass for a pair."""
     scenario = load_scenario(SCENARIO, robots=2)
-    policy = make_policy(f"own_policies:{name}", scenario)
+    policy = make_policy(f"own_policies:{name}", scenario, trust=True)
     with pytest.raises(ValueError, match=rf"^policy 'mine': [^\n]*{message}[^\n]*$"):
         run_policy(scenario, policy, name="mine")
     with pytest.raises(ValueError, match=rf"^policy 'mine': [^\n]*{message}[^\n]*$"):
@@ -317,7 +317,7 @@ def test_a_prediction_that_is_not_a_pair_of_actions_and_state_is_reported(name, 
 @pytest.mark.usefixtures("own_module")
 @pytest.mark.parametrize(("name", "message"), PREDICTS.items())
 def test_the_policy_of_the_other_robots_is_checked(name, message):
-    env = FormationEnv(SCENARIO, others=f"own_policies:{name}")
+    env = FormationEnv(SCENARIO, others=f"own_policies:{name}", trust=True)
     env.reset(seed=0)
     with pytest.raises(ValueError, match=rf"^others: [^\n]*{message}[^\n]*$"):
         env.step(np.zeros(2, np.float32))
@@ -337,7 +337,7 @@ def test_the_policy_of_the_other_robots_is_checked(name, message):
 )
 def test_the_command_line_reports_a_wrong_part_in_one_line(words, monkeypatch, capsys, tmp_path):
     out = ["--out", str(tmp_path / "out"), "--no-figures", "--horizon-s", "0.2"]
-    monkeypatch.setattr(sys, "argv", ["tlf", "run", "stop_and_go", *words, *out])
+    monkeypatch.setattr(sys, "argv", ["tlf", "run", "stop_and_go", "--trust", *words, *out])
     with pytest.raises(SystemExit) as left:
         main()
     assert left.value.code == 2
@@ -359,6 +359,7 @@ def test_a_run_warns_of_the_scenario_that_the_policy_asks_for(monkeypatch, capsy
         "wide.yaml",
         "--policy",
         "wide_asking:Sensing",
+        "--trust",
         "--no-figures",
         "--horizon-s",
         "0.2",

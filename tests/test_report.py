@@ -251,9 +251,9 @@ def test_a_command_names_the_permission_only_where_code_is_run():
     plan = replace(PLAN, trust=True)
     words = {
         policy: Commands(plan).words(Episode(policy, "infinity", "ice", 1.0, None, 7))
-        for policy in ("my model.zip", "entry:folder", "pure_pursuit")
+        for policy in ("my model.zip", "entry:folder", "mine:Policy", "reference:tuned", "adrc")
     }
-    assert [("--trust" in found) for found in words.values()] == [True, True, False]
+    assert [("--trust" in found) for found in words.values()] == [True, True, True, False, False]
     assert "'my model.zip'" in shlex.join(words["my model.zip"])
 
 
@@ -447,7 +447,17 @@ def test_eval_compares_a_file_with_the_default_and_is_resumed(tmp_path, monkeypa
     )
     monkeypatch.syspath_prepend(tmp_path)
     out = tmp_path / "out"
-    words = ["tlf", "eval", "still:Still", *EVAL.split(), "--replays", "1", "--out", str(out)]
+    words = [
+        "tlf",
+        "eval",
+        "still:Still",
+        "--trust",
+        *EVAL.split(),
+        "--replays",
+        "1",
+        "--out",
+        str(out),
+    ]
     monkeypatch.setattr(sys, "argv", words)
     cli.main()
     said = capsys.readouterr().out

@@ -5,15 +5,22 @@ from __future__ import annotations
 import csv
 import json
 import math
+import os
+import re
+from collections.abc import Iterable
 from pathlib import Path
+from typing import Any
+from urllib.parse import quote
 
 import numpy as np
 import pytest
 
 from baselines import ReferencePolicy, cli
+from baselines.pages.runs import write_index
 from baselines.policies.registry import fit_policy
 from baselines.runs import run as runs
-from baselines.runs.folders import FIGURES, RUN_FILES
+from baselines.runs.files import read_record
+from baselines.runs.folders import FIGURES, RUN_FILES, Identity, make_room
 from baselines.runs.run import RECORDED, run_policy
 from baselines.runs.signals import ACTIONS, OBSERVATION, SIGNALS
 from tlf_env import parallel_env
@@ -76,7 +83,7 @@ def test_every_different_run_has_a_folder_of_its_own(monkeypatch):
     assert len(names) == len(variants)
     assert any(name.startswith("circle-kanayama_searched+ekf-gyro") for name in names)
     page = Path("results/index.html").read_text(encoding="utf-8")
-    assert all(f'href="{name}/replay.html"' in page for name in names)
+    assert all(f'href="./{quote(name)}/replay.html"' in page for name in names)
     tlf(monkeypatch, "run", "circle", *SHORT)  # again: in its place
     assert folders() == names
 
@@ -325,3 +332,64 @@ def test_ctrl_c_keeps_and_marks_what_was_simulated(monkeypatch, capsys):
     monkeypatch.setattr(runs.PolicyDriver, "act", original)
     tlf(monkeypatch, "run", "circle", "--no-figures", "--out", "here")  # the same run, whole
     assert json.loads(Path("here/summary.json").read_text(encoding="utf-8"))["simulated_s"] == 100.0
+
+
+NAMES = [
+    "javascript:alert(1)",
+    "a#b?c%20d",
+    "<img src=x onerror=alert(2)>",
+    "\"'&",
+    b"\xff".decode("utf-8", "surrogateescape"),
+]
+
+
+def written_run(name: str, errors: Iterable[Any] = (1.0,), text: str = "a") -> None:
+    """A folder with the summary of a run, whose texts are all the same."""
+    robots = [{"position_rmse_mm": error, "lost": 0, "touched": 0} for error in errors]
+    about = {
+        "seed": 1,
+        "policy": text,
+        "robots": {f"robot_{i}": robot for i, robot in enumerate(robots)},
+        "scenario": {"name": text, "disturbance": {"name": text}},
+    }
+    Path(name).mkdir()
+    Path(name, "summary.json").write_text(json.dumps(about), encoding="utf-8")
+
+
+def test_the_page_of_runs_is_safe_with_any_name_of_a_folder():
+    for name, text in zip(NAMES, ["</td><script>alert(3)</script>", "\ud800", *"abc"], strict=True):
+        written_run(name, text=text)
+    source = write_index(Path()).read_text(encoding="utf-8")
+    body = source[source.index("<body>") :]
+    links = re.findall(r'href="([^"]*)"', body)
+    assert sorted(links) == sorted(f"./{quote(os.fsencode(name))}/" for name in NAMES)
+    assert "<script" not in body
+    assert "<img" not in body
+    assert body.count("&lt;script&gt;") == 3
+
+
+@pytest.mark.parametrize("wrong", [[10**400], ["x"], [[1]], [{}], [None], [math.nan], []])
+def test_a_summary_with_odd_numbers_does_not_stop_the_page_of_runs(wrong):
+    written_run("odd", wrong)
+    written_run("good")
+    assert "./good/" in write_index(Path()).read_text(encoding="utf-8")
+
+
+@pytest.mark.parametrize("written", [3, "x", None, {"a": 1}, ["../x", 3, "trajectory.npz"]])
+def test_a_damaged_list_of_files_does_not_stop_a_run(written, tmp_path):
+    Path("here").mkdir()
+    Path("x").touch()
+    identity = Identity("0", "a", None, 0, "{}")
+    Path("here/summary.json").write_text(json.dumps({"identity": list(identity), "files": written}))
+    make_room(Path("here"), identity, overwrite=False)
+    assert Path("x").exists()
+    assert not Path("here/summary.json").exists()
+
+
+def test_a_run_whose_scenario_is_wrong_is_refused_in_one_line(monkeypatch):
+    tlf(monkeypatch, "run", "circle", *SHORT, "--out", "here")
+    about = json.loads(Path("here/summary.json").read_text(encoding="utf-8"))
+    about["scenario"] |= {"robots": "x", "time_gap_s": -1}
+    Path("here/summary.json").write_text(json.dumps(about), encoding="utf-8")
+    with pytest.raises(ValueError, match=r"^here: a file of the run is broken: scenario\.[^\n]*$"):
+        read_record(Path("here"))

@@ -688,7 +688,8 @@ def test_parts_go_on_with_their_states(tmp_path):
 )
 def test_the_examples_and_the_shipped_estimators_go_on(role, part, monkeypatch):
     monkeypatch.chdir(ROOT)
-    fields = {role: part, "disturbance": "combined-medium", "end_on": ()}
+    trust = not part.startswith("baselines")  # the package's own parts need no permission
+    fields = {role: part, "disturbance": "combined-medium", "end_on": (), "trust": trust}
     env, other = (tlf_env.parallel_env("infinity", **fields) for _ in range(2))
     env.reset(seed=2)
     run_parts(env, 8)
@@ -1181,6 +1182,10 @@ RANGE = "^the snapshot is damaged: its episode has a step, seed or number out of
         ("arrays/ends", put(99, 0, 0), RANGE),
         ("arrays/touched_by", put(-3, 0, 0), RANGE),
         ("arrays/kinds", put(3, 0, 0), "its robots have other kinds of actions$"),
+        ("arrays/states", put(1e16, 0, 0, 0), "arrays/states has a number beyond ±1e"),
+        ("arrays/imposed", put(np.inf, 0, 0, 0), "imposed has a number that is not finite$"),
+        ("arrays/constants", put(0.0, 0, 0, 0), "robots have constants of another scenario$"),
+        ("arrays/constants", put(-1.0, 20, 1, 0), "robots have constants of another scenario$"),
         ("space/bodies", put(np.inf, 0, 0), "space/bodies has a number that is not finite$"),
         ("space/bodies", lambda a: a[:-1], r"space/bodies has the shape"),
         ("space/pair_counts", put(99, 0, 0), "damaged: pairs of shapes that are out of range$"),

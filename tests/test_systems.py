@@ -13,7 +13,6 @@ from baselines.policies.laws.textbook import FeedbackLinearisation, Kanayama
 from baselines.policies.registry import fit_policy, make_policy, policy_hash, policy_names
 from baselines.policies.systems import (
     ESTIMATORS,
-    PYTHON_ESTIMATORS,
     LimitedLaw,
     Limiter,
     load_limiter,
@@ -23,6 +22,7 @@ from baselines.policies.systems import (
 from baselines.runs.run import run_policy
 from tlf_env.common.presets import preset_names, yaml_text
 from tlf_env.onboard.controllers import controller
+from tlf_env.onboard.parts import PYTHON_ESTIMATORS
 from tlf_env.onboard.tracking import Controller
 from tlf_env.task.actions import FULL_SPEED_MM_S, FULL_YAW_RATE_RAD_S
 from tlf_env.task.observation import tracking_entries

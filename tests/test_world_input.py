@@ -71,8 +71,8 @@ WRONG = {
         "points_mm.0.1: Input should be a finite number, got nan",
     ),
     "a place too far away": (
-        wall(points_mm=[[0, 0], [1e300, 1]]),
-        "points_mm.1.0: Input should be less than or equal to 10000000000, got 1e+300",
+        wall(points_mm=[[0, 0], [1e14, 1]]),
+        "points_mm.1.0: Input should be less than or equal to 10000000000, got 100000000000000",
     ),
     "a negative thickness": (
         wall(thickness_mm=-1.0),
@@ -130,7 +130,7 @@ WRONG = {
     "a negative mass": (pushable(mass_kg=-1.0), "mass_kg: Input should be greater than 0, got -1"),
     "a mass of 0": (pushable(mass_kg=0.0), "mass_kg: Input should be greater than 0, got 0"),
     "a mass without an inverse": (
-        pushable(mass_kg=1e-320),
+        pushable(mass_kg=1e-10),
         "mass_kg: Input should be greater than or equal to 0.000001",
     ),
     "an inertia of 0": (

@@ -21,6 +21,7 @@ from baselines.runs.jobs import alone_in, spread
 from baselines.runs.provenance import physics_digest
 from baselines.runs.run import Record, run_policy, run_seeds, seed_blocks
 from tlf_env.common.errors import install_command
+from tlf_env.onboard.parts import check_trust
 from tlf_env.task.neutral import scenario_hash
 from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -33,7 +34,9 @@ def run_episode(plan: Plan, episode: Episode) -> dict[str, Any]:
     The scenario is the plan's with the fields that the policy asks for.
     """
     fitted = fit_policy(episode.policy, plan.scenario(episode), trust=plan.trust)
-    record = run_policy(fitted.scenario, fitted.policy, episode.seed, name=episode.policy)
+    record = run_policy(
+        fitted.scenario, fitted.policy, episode.seed, name=episode.policy, trust=plan.trust
+    )
     return _line(episode, fitted, record)
 
 
@@ -44,7 +47,7 @@ def run_block(plan: Plan, episodes: Sequence[Episode]) -> list[dict[str, Any]]:
     if fitted.scenario.plant != "batch":
         return [run_episode(plan, episode) for episode in episodes]
     seeds = [episode.seed for episode in episodes]
-    records = run_seeds(fitted.scenario, fitted.policy, seeds, name=first.policy)
+    records = run_seeds(fitted.scenario, fitted.policy, seeds, name=first.policy, trust=plan.trust)
     return [
         _line(episode, fitted, record) for episode, record in zip(episodes, records, strict=True)
     ]
@@ -72,7 +75,8 @@ def named_scenarios(plan: Plan) -> list[tuple[str, Scenario]]:
     Raises
     ------
     ValueError
-        as :meth:`Plan.scenario` and :func:`~baselines.policies.registry.fit_policy`.
+        as :meth:`Plan.scenario` and :func:`~baselines.policies.registry.fit_policy`, and for code without
+        permission.
     """
     named = []
     asked: dict[tuple[str, str], dict[str, Any]] = {}
@@ -85,6 +89,7 @@ def named_scenarios(plan: Plan) -> list[tuple[str, Scenario]]:
                     fitted = fit_policy(policy, scenario, trust=plan.trust)
                     asked[task, policy] = fitted.overrides
                 changed = load_scenario(scenario, **asked[task, policy])
+                check_trust(changed.code, plan.trust)
                 named.append((f"{task}, {disturbance}", changed))
     return named
 

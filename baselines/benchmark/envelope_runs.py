@@ -30,6 +30,7 @@ from baselines.runs.outcome import failed
 from baselines.runs.provenance import git_revision, physics_digest, simulation_digest, versions
 from baselines.runs.run import run_seeds, seed_blocks
 from tlf_env.numerics.philox import checked_seed
+from tlf_env.onboard.parts import check_trust
 from tlf_env.task.neutral import scenario_hash
 
 LEVELS_FILE, PLAN_FILE = "levels.jsonl", "envelope_plan.json"
@@ -57,7 +58,12 @@ def run_probe(plan: EnvelopePlan, probe: Probe) -> dict[str, Any]:
     for seeds in seed_blocks(range(*plan.seeds)):
         runs = 0
         for record in run_seeds(
-            fitted.scenario, fitted.policy, seeds, name=probe.policy, most_failed=most - lost
+            fitted.scenario,
+            fitted.policy,
+            seeds,
+            name=probe.policy,
+            most_failed=most - lost,
+            trust=plan.trust,
         ):
             runs += 1
             metrics = record.metrics()
@@ -93,7 +99,8 @@ def plan_record(plan: EnvelopePlan) -> dict[str, Any]:
     Raises
     ------
     ValueError
-        for an unknown name, a knob outside its range, a seed too large, or a policy that does not fit.
+        for an unknown name, a knob outside its range, a seed too large, a policy that does not fit, or code
+        without permission.
     """
     checked_seed(plan.seeds[1] - 1)
     scenarios, policies = {}, {}
@@ -104,7 +111,9 @@ def plan_record(plan: EnvelopePlan) -> dict[str, Any]:
                     scenario
                 )
         for name in plan.policies:
-            policies[name] = policy_hash(name, fit_policy(name, scenario, trust=plan.trust).policy)
+            fitted = fit_policy(name, scenario, trust=plan.trust)
+            check_trust(fitted.scenario.code, plan.trust)
+            policies[name] = policy_hash(name, fitted.policy)
     asked = asdict(plan)
     del asked["trust"]  # a permission, which changes no result
     return {

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 from baselines.benchmark.lines import Line, Stratum, worst
 from baselines.benchmark.plan import Episode, Plan
-from baselines.policies.systems import ENTRY
+from baselines.policies.registry import runs_code
 from baselines.runs.outcome import failed
 from tlf_env.common.presets import parsed_yaml
 from tlf_env.task.scenario import Scenario, scenario_with
@@ -57,7 +57,7 @@ class Commands:
         place = self._place(episode.task, episode.disturbance, episode.sweep)
         if place is None:
             return None
-        code = episode.policy.lower().endswith(".zip") or episode.policy.startswith(ENTRY)
+        code = runs_code(episode.policy) or self._plan.scenario(episode).code
         trust = ["--trust"] if self._plan.trust and code else []
         policy = ["--policy", episode.policy, "--seed", str(episode.seed)]
         return ["run", *place, *policy, *trust]

@@ -16,6 +16,8 @@ from tlf_env.common.presets import beside, is_file_name, preset_names, read_pres
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.task.scenario import Scenario, load_scenario
 
+MOST_SEEDS = 1_000_000
+MOST_SWEPT = 10_000  # values of a sweep
 SWEEP_DIGITS = 6  # of values that are not given but computed on a logarithmic scale
 
 
@@ -133,7 +135,7 @@ def parse_sweep(text: str) -> tuple[str, tuple[float, ...]]:
             raise ValueError
     except ValueError:
         raise ValueError(
-            f"sweep {text!r} must be PATH=FIRST:LAST:COUNT with COUNT at least 2, "
+            f"sweep {text!r} must be PATH=FIRST:LAST:COUNT with COUNT from 2 to {MOST_SWEPT}, "
             "e.g. slip.delta_1_mm_s=0:40:9; PATH=FIRST:LAST:COUNT:log with FIRST and LAST above 0; or "
             "PATH=VALUE,VALUE,..."
         ) from None
@@ -147,6 +149,8 @@ def _values(span: str) -> tuple[float, ...]:
     first, last, count = (
         kind(part) for kind, part in zip((float, float, int), ends.split(":"), strict=True)
     )
+    if count > MOST_SWEPT:
+        raise ValueError
     shares = [i / (count - 1) for i in range(count)] if count > 1 else []
     if ends == span:
         return tuple(first + (last - first) * share for share in shares)
@@ -185,6 +189,8 @@ def parse_seeds(text: str) -> SeedRange:
     first, _, end = text.partition(":")
     if not (first.isdecimal() and end.isdecimal() and int(first) < int(end)):
         raise ValueError(f"seeds {text!r} must be FIRST:END, e.g. 20000:20050")
+    if int(end) - int(first) > MOST_SEEDS:
+        raise ValueError(f"seeds {text!r} are more than {MOST_SEEDS}, the most of a plan")
     return int(first), int(end)
 
 

@@ -72,7 +72,9 @@ def _error(line: Line) -> float:
 def record_of(plan: Plan, episode: Episode) -> Record:
     """An episode of a plan, run again by itself and recorded with all its signals."""
     fitted = fit_policy(episode.policy, plan.scenario(episode), trust=plan.trust)
-    return run_policy(fitted.scenario, fitted.policy, episode.seed, name=episode.policy)
+    return run_policy(
+        fitted.scenario, fitted.policy, episode.seed, name=episode.policy, trust=plan.trust
+    )
 
 
 def differences(record: Record, line: Line) -> list[str]:

@@ -47,7 +47,7 @@ def run(
             help="reference[:GAINS], reference:FILE.yaml, pure_pursuit, feedback_linearisation, kanayama, "
             "lqr, sliding_mode, adrc, nmpc, CONTROLLER+ESTIMATOR+LIMITER of these (e.g. "
             "kanayama+ekf-slip+body), the name of a shipped policy, FILE.safetensors (with FILE.json), "
-            "module:factory; with --trust FILE.zip and entry:FOLDER (a competition's entry).",
+            "entry:FOLDER (a competition's entry); with --trust module:factory and FILE.zip.",
         ),
     ] = "reference",
     gains: Annotated[
@@ -61,11 +61,15 @@ def run(
         str | None,
         typer.Option(
             help="ekf-gyro (default), ekf-slip, ekf (the paper's), truth (the true pose and slip), or "
-            "module:factory."
+            "with --trust module:factory."
         ),
     ] = None,
-    wheel_loop: Annotated[str | None, typer.Option(help="Own wheel loop, module:factory.")] = None,
-    observer: Annotated[str | None, typer.Option(help="Own observer, module:factory.")] = None,
+    wheel_loop: Annotated[
+        str | None, typer.Option(help="Own wheel loop, module:factory (with --trust).")
+    ] = None,
+    observer: Annotated[
+        str | None, typer.Option(help="Own observer, module:factory (with --trust).")
+    ] = None,
     seed: Annotated[int, typer.Option(help="Seed of all random draws.")] = 0,
     robots: Annotated[int | None, typer.Option(help="Number of robots.")] = None,
     plant: Annotated[

@@ -46,7 +46,8 @@ RAY = typer.Option(help="Address of an existing Ray cluster to run on instead.")
 
 
 TRUST = typer.Option(
-    "--trust", help="Load SB3 .zip files and run entries' programs: code that they contain."
+    "--trust",
+    help="Run code: module:factory (also where a file names it), SB3 .zip files, programs of entries.",
 )
 
 

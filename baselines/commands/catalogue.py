@@ -30,9 +30,9 @@ POLICY_FORMS = {
     "CONTROLLER+ESTIMATOR+LIMITER": "A reference or a law on another estimator, and behind a limiter.",
     "LAW:FILE.yaml": "A law with parameters of a file; reference:FILE.yaml likewise.",
     "FILE.safetensors": "A trained policy, with its card FILE.json beside it.",
-    "module:factory": "A policy in Python, with SB3's predict.",
-    "FILE.zip": "A model saved by SB3 (PPO, SAC, TD3), with --trust.",
-    "entry:FOLDER": "The entry to a competition, with --trust.",
+    "module:factory": "A policy in Python, with SB3's predict; with --trust.",
+    "FILE.zip": "A model saved by SB3 (PPO, SAC, TD3); with --trust.",
+    "entry:FOLDER": "The entry to a competition; one that is a program with --trust.",
 }
 ESTIMATOR_LINES = {
     "ekf-gyro": "EKF that reads encoders, position fixes, gyro and motor torques: the default.",

@@ -21,7 +21,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
         "tlf run infinity": "the default controller, without disturbance",
         "tlf run flower --disturbance slip --policy residual": "a learned policy on slip",
         "tlf run infinity --set time_gap_s=3 --seed 7": "any field of the scenario",
-        "tlf run own.yaml --policy my_module:make": "a task and a policy of your own",
+        "tlf run own.yaml --policy my_module:make --trust": "a task and a policy of your own",
         "tlf run infinity --disturbance slip --video slip.mp4": "a video, too",
     },
     "view": {

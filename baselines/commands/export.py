@@ -13,6 +13,7 @@ from baselines.data.files import MINARI_FOLDER, About, write_minari, write_parqu
 from baselines.policies.registry import fit_policy
 from baselines.runs.provenance import versions
 from tlf_env.envs.parallel import parallel_env
+from tlf_env.onboard.parts import check_trust
 from tlf_env.task.scenario import load_scenario
 
 FORMS = ("parquet", "minari")
@@ -49,6 +50,8 @@ def export_command(
         for task in listed(tasks)
         for one in listed(disturbances)
     ]
+    for fit in fitted:
+        check_trust(fit.scenario.code, trust)
     kinds = {(one.scenario.action, tuple(entry_names(one.scenario))) for one in fitted}
     if len(kinds) > 1:
         raise ValueError("the tasks must have the same action and the same observation")
@@ -71,7 +74,9 @@ def export_command(
     formations = len(fitted) * (end - first)
     with progress_bar("export") as update:
         pairs = [(one.scenario, one.policy) for one in fitted]
-        for one in collected(pairs, range(first, end), policy, joint=joint, noise=noise):
+        for one in collected(
+            pairs, range(first, end), policy, joint=joint, noise=noise, trust=trust
+        ):
             episodes.append(one)
             per_formation = 1 if joint else scenario.robot_count
             update(min(len(episodes) // per_formation, formations), formations)
@@ -81,7 +86,7 @@ def export_command(
         write_parquet(episodes, about, path)
         use = f"imitation: {{data: {path}}} or offline: {{data: {path}}} in a training's file"
     else:
-        space = parallel_env(scenario).observation_space("robot_0")
+        space = parallel_env(scenario, trust=trust).observation_space("robot_0")
         write_minari(episodes, about, space, out, f"tlf_env/{name}-v0")
         path = out / f"tlf_env/{name}-v0"
         load = f"import minari; data = minari.load_dataset('tlf_env/{name}-v0')"

@@ -51,6 +51,7 @@ from baselines.runs.video import FPS, Film, check_video, write_video
 from baselines.tables import metrics_table
 from tlf_env.common.presets import preset_names
 from tlf_env.numerics.philox import checked_seed
+from tlf_env.onboard.parts import check_trust
 from tlf_env.task.scenario import Scenario, load_scenario, scenario_notes
 from tlf_env.task.start import start_options
 
@@ -91,6 +92,7 @@ def run_command(
     start_options(options, chosen.robot_count)
     film = asked_film(wanted)
     fitted = fit_policy(name, chosen, trust=trust)
+    check_trust(fitted.scenario.code, trust)
     if fitted.overrides:
         fields = ", ".join(describe_overrides(fitted.overrides))
         notes.print(f"tlf: note: {name} asks for {fields}", soft_wrap=True)
@@ -117,6 +119,7 @@ def run_command(
                 progress=update,
                 watch=film,
                 keep_interrupted=True,
+                trust=trust,
             )
         if record.interrupted and whole:
             notes.print(

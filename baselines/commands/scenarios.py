@@ -6,6 +6,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from typing import Any
 
+from tlf_env.common.errors import path_text
 from tlf_env.common.presets import parsed_yaml
 from tlf_env.task.display import whole_text
 from tlf_env.task.scenario import Scenario, scenario_with
@@ -58,7 +59,7 @@ def parsed_setting(text: str) -> tuple[str, Any]:
         raise ValueError(
             f"--set {text!r} must be PATH=VALUE, for example time_gap_s=3 or disturbance.level=2"
         )
-    return path.strip(), parsed_yaml(value, f"--set {text}")
+    return path.strip(), parsed_yaml(value, f"--set {path_text(text)}")
 
 
 def shown_scenario(scenario: Scenario) -> str:

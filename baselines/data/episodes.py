@@ -40,7 +40,13 @@ def entry_names(scenario: Scenario) -> list[str]:
 
 
 def robots_of(
-    scenario: Scenario, policy: Policy, seed: int, name: str = "policy", noise: float = 0.0
+    scenario: Scenario,
+    policy: Policy,
+    seed: int,
+    name: str = "policy",
+    noise: float = 0.0,
+    *,
+    trust: bool = False,
 ) -> list[RobotEpisode]:
     """An episode for each robot of one formation, driven by a policy in the parallel environment.
 
@@ -49,13 +55,15 @@ def robots_of(
     noise
         Standard deviation of normal noise on the actions, from 0 on, drawn anew in each step from a generator
         with the seed. The episode has the actions with it, within ±1.
+    trust
+        Whether code that the scenario names (``"module:factory"``) may be imported.
 
     Raises
     ------
     ValueError
         naming the policy, if its ``predict`` returns no actions of the right shape.
     """
-    env = parallel_env(scenario, infos=False)
+    env = parallel_env(scenario, infos=False, trust=trust)
     found, _ = env.reset(seed=seed)
     agents = list(env.agents)
     seen, acted, rewarded = [np.stack([found[one] for one in agents])], [], []
@@ -114,11 +122,12 @@ def collected(
     *,
     joint: bool,
     noise: float = 0.0,
+    trust: bool = False,
 ) -> Iterator[RobotEpisode]:
     """Episodes of every scenario and seed, those of a formation one after another."""
     for scenario, policy in scenarios:
         for seed in seeds:
-            robots = robots_of(scenario, policy, seed, name, noise)
+            robots = robots_of(scenario, policy, seed, name, noise, trust=trust)
             if joint:
                 yield together(robots)
             else:

@@ -146,7 +146,8 @@ def read_rows(path: Path) -> Rows:
         table = pq.read_table(pa.BufferReader(content))
         about = About(**json.loads((table.schema.metadata or {})[ABOUT]))
     except OSError as error:
-        raise ValueError(f"cannot read {name}: {error.strerror or error}") from error
+        why = " ".join(str(error.strerror or error).split())
+        raise ValueError(f"cannot read {name}: {why}") from error
     except (ValueError, KeyError, TypeError) as error:
         raise ValueError(f"{name} is no data set of `tlf export`") from error
     names = [f"observation_{one}" for one in about.entries]

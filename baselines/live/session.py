@@ -100,7 +100,8 @@ class Session:
     def _formation(self, fitted: FittedPolicy) -> Formation:
         scenario = fitted.scenario
         live = {"adversary": scenario.adversary or scenario.plant in WITH_FORCES}
-        return Formation(scenario.model_copy(update={"end_on": (), **live}))
+        alike = scenario.model_copy(update={"end_on": (), **live})
+        return Formation(alike, trust=self._trust)
 
     def next_seed(self) -> None:
         """Start again with the next seed."""

@@ -54,7 +54,12 @@ def page(
 
 def text(value: object) -> str:
     """Plain text for a page, also inside a quoted attribute."""
-    return html.escape(str(value), quote=True)
+    return html.escape(encodable(str(value)), quote=True)
+
+
+def encodable(value: str) -> str:
+    """A text that UTF-8 can encode: halves of surrogate pairs, as in some JSON and file names, are ``?``."""
+    return value.encode("utf-8", "replace").decode("utf-8")
 
 
 def embedded(data: Mapping[str, Any]) -> str:
@@ -66,7 +71,12 @@ def embedded(data: Mapping[str, Any]) -> str:
         for NaN and infinities.
     """
     whole = json.dumps(data, ensure_ascii=False, allow_nan=False, separators=(",", ":"))
-    return whole.replace("<", "\\u003c").replace("\u2028", "\\u2028").replace("\u2029", "\\u2029")
+    return (
+        encodable(whole)
+        .replace("<", "\\u003c")
+        .replace("\u2028", "\\u2028")
+        .replace("\u2029", "\\u2029")
+    )
 
 
 @cache

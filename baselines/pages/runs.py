@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
+from urllib.parse import quote
 
 from baselines.pages.page import page, text
 from baselines.runs.folders import INDEX, REPLAY, SUMMARY, verdict
+from tlf_env.common.errors import path_text
 from tlf_env.common.files import atomic, read_json
+from tlf_env.common.models import as_float
 
 HEADINGS = (
     "run",
@@ -53,25 +57,27 @@ def _row(path: Path) -> str | None:
         data = read_json(path)
         robots = list(data["robots"].values())
         errors = [robot["position_rmse_mm"] for robot in robots]
+        known = [as_float(error) for error in errors if error is not None]
         scenario = data["scenario"]
         cells = [
             scenario["name"],
             data["policy"],
             scenario["disturbance"]["name"],
             str(data["seed"]),
-            "–" if None in errors else f"{max(errors):.2f}",
+            "–" if len(known) < len(errors) else f"{max(known):.2f}",
             verdict(data.get("interrupted", False), robots),
         ]
     except (ValueError, TypeError, KeyError, AttributeError):
         return None
-    name = text(path.parent.name)
-    replay = path.parent / REPLAY
-    opened = f"{name}/{replay.name}" if replay.exists() else f"{name}/"
+    # With "./" no name of a folder is taken for a scheme, as javascript: would be.
+    place = text(f"./{quote(os.fsencode(path.parent.name))}")
+    opened = f"{place}/{REPLAY}" if (path.parent / REPLAY).exists() else f"{place}/"
     picture = path.parent / "overview.png"
     image = (
-        f'<a href="{name}/{picture.name}"><img src="{name}/{picture.name}" height="80" alt="overview"></a>'
+        f'<a href="{place}/{picture.name}"><img src="{place}/{picture.name}" height="80" alt="overview"></a>'
         if picture.exists()
         else ""
     )
     texts = "".join(f"<td{_aligned(number)}>{text(cell)}</td>" for number, cell in enumerate(cells))
+    name = text(path_text(path.parent.name))
     return f'<tr><td><a href="{opened}">{name}</a></td>{texts}<td class="text">{image}</td></tr>'

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tlf_env.common.errors import path_text, shown
+from tlf_env.task.waypoints import MAX_COORDINATE_MM
 
 MM = {"mm": 1.0, "cm": 10.0, "m": 1000.0, "km": 1e6}  # in a unit of length
 SECONDS = {
@@ -47,6 +48,8 @@ AXIS_NAMES = {
 }
 UNIT_SUFFIX = re.compile(r"^(?P<name>.*?)[ _]*[\[(_ ](?P<unit>mm|cm|m|km|s|ms|us|ns)[\])]?$")
 SMALLEST_MM = 100.0  # a smaller path is probably in another unit
+LARGEST = Decimal("1e20")  # of a number; nanoseconds since 1970 are 2e18
+MOST_LISTED = 300  # characters of a header in an error
 SAMPLED_ROWS = 200  # at the start, by which the form is found
 
 
@@ -123,7 +126,14 @@ def read_log(path: Path, columns: str | None = None, units: str | None = None) -
         f"{len(lines)} rows, separated by {_words(form.delimiter)}, with a decimal {_words(form.decimal)}",
         f"columns {numbers} are time in {time_unit}, x and y in {unit}{said}",
     )
-    return Log(t_s, xy * MM[unit], lines, notes)
+    xy_mm = xy * MM[unit]
+    far = np.flatnonzero(np.abs(xy_mm).max(axis=1) > MAX_COORDINATE_MM)
+    if len(far):
+        raise ValueError(
+            f"{name}, line {lines[far[0]]}: x and y must be within ±{MAX_COORDINATE_MM:g} mm, got "
+            f"{', '.join(f'{one:g}' for one in xy_mm[far[0]])}"
+        )
+    return Log(t_s, xy_mm, lines, notes)
 
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
@@ -185,7 +195,7 @@ def _columns(name: str, header: list[str] | None, wanted: str | None, count: int
         if len(hits) != 1:
             which = "no column" if not hits else f"{len(hits)} columns"
             raise ValueError(
-                f"{name}: {which} for {kind} in the header {', '.join(header)}; --columns names those of time, "
+                f"{name}: {which} for {kind} in the header {_listed(header)}; --columns names those of time, "
                 "x and y"
             )
         found.append(Column(hits[0], _unit(header[hits[0]])))
@@ -197,9 +207,17 @@ def _asked_column(name: str, header: list[str] | None, asked: str, count: int) -
         return Column(header.index(asked), _unit(asked))
     if asked.isdecimal() and 1 <= int(asked) <= count:
         number = int(asked) - 1
-        return Column(number, None if header is None else _unit(header[number]))
-    there = ", ".join(header) if header else f"1 to {count}"
+        # A header may have fewer columns than the rows.
+        named = header is not None and number < len(header)
+        return Column(number, _unit(header[number]) if header is not None and named else None)
+    there = _listed(header) if header else f"1 to {count}"
     raise ValueError(f"{name} has no column {asked!r}; the columns are {there}")
+
+
+def _listed(header: list[str]) -> str:
+    """The names of a header, in one line that is not too long."""
+    text = path_text(", ".join(header))
+    return text if len(text) <= MOST_LISTED else f"{text[:MOST_LISTED]}..."
 
 
 def _plain_name(cell: str) -> str:
@@ -244,6 +262,12 @@ def _values(
     if len(times) < 2:
         raise ValueError(f"{name} must have at least two rows of numbers, got {len(times)}")
     t_s = np.array([float((time - times[0]) * scale) for time in times])
+    together = np.flatnonzero(np.diff(t_s) <= 0.0)
+    if len(together):
+        line = body[together[0] + 1][0]
+        raise ValueError(
+            f"{name}, line {line}: its time {times[together[0] + 1]} is too near to the one before it"
+        )
     return t_s, np.array(points), tuple(line for line, _ in body)
 
 
@@ -253,6 +277,10 @@ def _value(name: str, form: Form, line: int, cells: list[str], number: int) -> D
     value = form.number(cell)
     if value is None:
         raise ValueError(f"{name}, line {line}: {shown(cell)} in column {number + 1} is no number")
+    if value.copy_abs() > LARGEST:
+        raise ValueError(
+            f"{name}, line {line}: {shown(cell)} in column {number + 1} must be within ±{LARGEST:g}"
+        )
     return value
 
 

@@ -11,6 +11,7 @@ from baselines.paths.read import Log
 
 SPACING_S = 0.1  # between the points that are written
 GRID_MM = 5.0  # along the path, for its times
+MOST_POINTS = 2_000_000  # of a path: 55 h, or 10 km
 LATERAL_MM_S2 = 150.0  # of the limiter `grip`: what tyres on a slippery floor transmit
 ACCELERATION_MM_S2 = 100.0
 TURN_RAD_S = 1.0
@@ -33,6 +34,11 @@ def smoothed(log: Log, noise_mm: float) -> tuple[np.ndarray, np.ndarray, Deviati
     noise_mm
         Standard deviation of the log's noise per coordinate, mm: the spline is as smooth as it can be with an
         error of this size.
+
+    Raises
+    ------
+    ValueError
+        for a log that is too long in time.
     """
     from scipy.interpolate import UnivariateSpline
 
@@ -48,7 +54,17 @@ def smoothed(log: Log, noise_mm: float) -> tuple[np.ndarray, np.ndarray, Deviati
 
 
 def evenly(end_s: float) -> np.ndarray:
-    """Times from 0 to the end, about :data:`SPACING_S` apart."""
+    """Times from 0 to the end, about :data:`SPACING_S` apart.
+
+    Raises
+    ------
+    ValueError
+        for more than :data:`MOST_POINTS` of them.
+    """
+    if not end_s <= MOST_POINTS * SPACING_S:
+        raise ValueError(
+            f"the path takes {end_s:g} s; at most {MOST_POINTS * SPACING_S:g} s can be smoothed or timed anew"
+        )
     return np.linspace(0.0, end_s, max(round(end_s / SPACING_S), 1) + 1)
 
 
@@ -73,7 +89,7 @@ def retimed(points: np.ndarray, speed_mm_s: float) -> tuple[np.ndarray, np.ndarr
     Raises
     ------
     ValueError
-        for a path without length.
+        for a path without length, and one that is too long, in space or in time.
     """
     from scipy.interpolate import CubicSpline
 
@@ -84,6 +100,10 @@ def retimed(points: np.ndarray, speed_mm_s: float) -> tuple[np.ndarray, np.ndarr
     if len(points) < 3:
         raise ValueError(
             "the path has no length; a speed limit needs at least three different points"
+        )
+    if not along[-1] <= MOST_POINTS * GRID_MM:
+        raise ValueError(
+            f"the path is {along[-1]:g} mm long; at most {MOST_POINTS * GRID_MM:g} mm can be timed anew"
         )
     curve = CubicSpline(along, points)
     s = np.linspace(0.0, along[-1], max(math.ceil(along[-1] / GRID_MM), 2) + 1)

@@ -22,6 +22,7 @@ from baselines.policies.network import NORMALISATION, Network
 from tlf_env.common.errors import one_line
 from tlf_env.common.files import atomic, parse_json
 from tlf_env.common.models import Frozen, NonNegative, Positive, Whole
+from tlf_env.common.presets import check_named_files
 from tlf_env.onboard.limiters import Limiter
 from tlf_env.onboard.parts import is_part
 from tlf_env.onboard.rays import Rays
@@ -273,13 +274,14 @@ def read_policy(path: Path) -> Loaded:
     Raises
     ------
     ValueError
-        in one line: a file is missing or damaged, the card has an unknown key or a wrong value, the
-        weights are not those of the card, or a tensor is missing, unknown, of a wrong shape or not
-        finite.
+        in one line: a file is missing or damaged, the card has an unknown key or a wrong value or names a
+        file elsewhere, the weights are not those of the card, or a tensor is missing, unknown, of a wrong
+        shape or not finite.
     """
     data = _bytes_of(path, "")
     place = card_path(path)
     card = _card(place, _bytes_of(place, f"{path} needs its card: "))
+    check_named_files(place, card.residual_base)
     try:
         tensors = load(data)
     except (SafetensorError, KeyError, ValueError) as error:

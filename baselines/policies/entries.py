@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -12,9 +13,9 @@ from baselines.policies.card import WEIGHTS
 from baselines.policies.entry_process import PROTOCOL, EntryProcess
 from baselines.policies.learned import LearnedPolicy, load_policy
 from baselines.policies.systems import ENTRY
-from tlf_env.common.errors import one_line
+from tlf_env.common.errors import one_line, shown
 from tlf_env.common.models import Frozen
-from tlf_env.common.presets import read_yaml
+from tlf_env.common.presets import check_named_files, read_yaml
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS
 from tlf_env.onboard.limiters import Limiter
@@ -99,10 +100,12 @@ def load_entry(folder: Path) -> EntryCard:
         in one line, for a folder without ``entry.yaml``, an unknown key, and an invalid value.
     """
     path = folder / ENTRY_FILE
-    if not path.is_file():
-        raise ValueError(f"entry {str(folder)!r} has no file {ENTRY_FILE}")
+    if not os.path.isfile(path):  # noqa: PTH113 - Path's raises an error for a name that is too long
+        raise ValueError(f"entry {shown(str(folder))} has no file {ENTRY_FILE}")
+    data = read_yaml(path)
+    check_named_files(path, data.get("scenario"))
     try:
-        return EntryCard.model_validate(read_yaml(path))
+        return EntryCard.model_validate(data)
     except ValidationError as error:
         raise ValueError(f"{path}: {one_line(error, EntryCard)}") from error
 

@@ -84,12 +84,12 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
         with SB3's ``predict``, ``entry:FOLDER`` of a competition's entry, or the path of an SB3 ``.zip``
         file.
     trust
-        Allow an SB3 ``.zip`` file and an entry's program: both run code that is in them.
+        Allow ``module:factory``, an SB3 ``.zip`` file and an entry's program: all of them run code.
 
     Raises
     ------
     ValueError
-        for an unknown name, a file that cannot be read, an untrusted ``.zip``, or a policy that does
+        for an unknown name, a file that cannot be read, code without permission, or a policy that does
         not fit the scenario.
     """
     policy = _made(name, scenario, trust=trust)
@@ -230,13 +230,23 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
     if head in LAWS:
         check_interface(name, scenario, action="twist", observation="tracking")
         return make_law(head, tail, scenario)
-    if tail:
-        return make_part("policy", name, load_part(name))
+    if runs_code(name):
+        return make_part("policy", name, load_part("policy", name, trust=trust))
     names = [*policy_names(), *shipped_policies()]
     raise ValueError(
         f"policy {name!r} is not one of {', '.join(names)}, FILE{WEIGHTS}, module:factory, FILE.zip, "
         f"{ENTRY}FOLDER{suggestion(name, names)}"
     )
+
+
+def runs_code(name: str) -> bool:
+    """Whether a policy's name stands for code, which needs ``trust``; an entry of either kind counts."""
+    if name.startswith(ENTRY) or name.lower().endswith(".zip"):
+        return True
+    if name.lower().endswith(WEIGHTS) or name in shipped_policies() or parse_system(name):
+        return False
+    head, _, tail = name.partition(":")
+    return bool(tail) and head != "reference" and head not in LAWS
 
 
 def check_interface(name: str, scenario: Scenario, *, action: str, observation: str) -> None:

@@ -13,13 +13,13 @@ import numpy as np
 from baselines.policies.laws.catalogue import LAWS, law_names, make_law
 from baselines.policies.laws.law import Law
 from baselines.policies.reference import ReferencePolicy
-from tlf_env.common.errors import suggestion
+from tlf_env.common.errors import shown, suggestion
 from tlf_env.common.presets import is_file_name, preset_names, preset_or_file
 from tlf_env.numerics.compiled import driver
 from tlf_env.onboard.controllers import controller_for, controller_names
 from tlf_env.onboard.kinds import DEFAULT_CONTROLLER, ESTIMATOR_KINDS, EstimatorKind
 from tlf_env.onboard.limiters import Limiter, behind, limiter_files, load_limiter, own_limiter
-from tlf_env.onboard.parts import Policy, load_part
+from tlf_env.onboard.parts import PYTHON_ESTIMATORS, Policy, load_part
 from tlf_env.onboard.supervisor import Neighbour, SupervisorRow, supervisor_row
 from tlf_env.onboard.tracking import Controller, ControllerRow, controller_row
 from tlf_env.task.actions import ACTION_SIZE, allowed_twist, twist_action
@@ -31,10 +31,6 @@ NOT_LIMITED = (".zip", ".safetensors")  # learned policies, whose paths may cont
 
 
 SMOOTHED: tuple[EstimatorKind, ...] = ("ekf", "ekf-slip", "ekf-gyro")
-PYTHON_ESTIMATORS = {
-    "ukf": "baselines.policies.estimators.unscented:UnscentedEstimator",
-    "moving-horizon": "baselines.policies.estimators.moving_horizon:MovingHorizonEstimator",
-}
 # The fields of the scenario that an estimator's name sets: the filter on board and parameters of it, and the
 # smoothing of what is broadcast of it.
 FILTERS: dict[str, dict[str, Any]] = {
@@ -247,7 +243,7 @@ def estimator_files(name: str) -> list[Path]:
     if name not in PYTHON_ESTIMATORS:
         return []
     package = PYTHON_ESTIMATORS[name].rpartition(".")[0]
-    made: Any = load_part(PYTHON_ESTIMATORS[name])
+    made: Any = load_part("estimator", PYTHON_ESTIMATORS[name], trust=False)
     return [
         Path(inspect.getfile(one))
         for one in inspect.getmro(made)
@@ -259,6 +255,6 @@ def _unknown(name: str, part: str, given: str, allowed: Iterable[str]) -> ValueE
     """The error for an unknown part of a system."""
     names = list(allowed)
     return ValueError(
-        f"system {name!r}: {part} {given!r} is not one of {', '.join(names)}{suggestion(given, names)}"
-        f"; a system is {FORM}"
+        f"system {shown(name)}: {part} {shown(given)} is not one of {', '.join(names)}"
+        f"{suggestion(given, names)}; a system is {FORM}"
     )

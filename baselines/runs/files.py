@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import json
+import zlib
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
+from pydantic import ValidationError
 
 from baselines.runs.folders import IDENTITY, INTERRUPTED, SUMMARY, WRITTEN, Identity
 from baselines.runs.provenance import versions
 from baselines.runs.run import RECORDED, Record
 from baselines.runs.signals import OBSERVATION
-from tlf_env.common.errors import install_command
+from tlf_env.common.errors import install_command, one_line
 from tlf_env.common.files import atomic, read_json
 from tlf_env.task.scenario import Scenario
 
 TRAJECTORY = "trajectory.npz"
+# What NumPy and the reader of archives raise for a file that is none, or damaged.
+BROKEN = (OSError, ValueError, EOFError, RuntimeError, BadZipFile, zlib.error)
 ENDS = ("lost_at_s", "touched_at_s", "touched_by")  # arrays of a record, (robot,)
 
 
@@ -120,27 +124,60 @@ def read_record(folder: Path) -> Record:
             objects=found.pop("objects", None),
             columns={name: found.pop(name) for name in RECORDED},
             signals=found,
-            options=written["reset_options"],
+            options=_options(written["reset_options"]),
             interrupted=bool(written[INTERRUPTED]),
             **ends,
         )
     except FileNotFoundError:
         raise ValueError(f"{folder} holds no run: there is no {TRAJECTORY} in it") from None
-    except (KeyError, TypeError) as error:
+    except ValidationError as error:
+        why = one_line(error, Scenario)
+        raise ValueError(f"{folder}: a file of the run is broken: scenario.{why}") from None
+    except (KeyError, TypeError, OverflowError) as error:
         raise ValueError(
             f"{folder}: {error} is missing or wrong; run it again with this version"
         ) from None
-    except (OSError, ValueError, BadZipFile) as error:
-        raise ValueError(f"{folder}: a file of the run is broken: {error}") from None
-    shape = (len(record.t_s), record.robots)
-    wrong = [
-        name for name, one in (record.columns | dict(record.signals)).items() if one.shape != shape
-    ]
-    if wrong or len(scenario.robot_models) != record.robots:
-        raise ValueError(
-            f"{path}: {', '.join(wrong) or 'robots'}: not {shape[0]} times and {shape[1]} robots"
-        )
+    except BROKEN as error:
+        why = " ".join(str(error).split())
+        raise ValueError(f"{folder}: a file of the run is broken: {why}") from None
+    _check_arrays(record, path)
     return record
+
+
+def _options(found: Any) -> dict[str, Any] | None:
+    if not isinstance(found, dict | None):
+        raise TypeError("reset_options")
+    return found
+
+
+def _check_arrays(record: Record, path: Path) -> None:
+    """Check types and shapes of a record's arrays.
+
+    Raises
+    ------
+    ValueError
+        naming the file and the arrays that do not fit.
+    """
+    times, robots = np.size(record.t_s), len(record.scenario.robot_models)
+    wanted: dict[str, tuple[np.ndarray, tuple[int, ...]]] = {
+        "t_s": (record.t_s, (times,)),
+        "leader_reference_mm": (record.leader, (times, 2)),
+        **{name: (getattr(record, name), (robots,)) for name in ENDS},
+        **{name: (one, (times, robots)) for name, one in record.columns.items()},
+        **{name: (one, (times, robots)) for name, one in record.signals.items()},
+    }
+    if record.objects is not None:
+        things = len(record.scenario.world.pushables) + len(record.scenario.world.moving)
+        wanted["objects"] = (record.objects, (times, things, 3))
+    wrong = [
+        name
+        for name, (one, shape) in wanted.items()
+        if one.shape != shape or one.dtype.kind not in "biuf"
+    ]
+    if wrong or not times:
+        raise ValueError(
+            f"{path}: {', '.join(wrong) or 'robots'}: not numbers of {times} times and {robots} robots"
+        )
 
 
 def write_summary(record: Record, folder: Path, identity: Identity, written: list[Path]) -> Path:

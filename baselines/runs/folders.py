@@ -128,10 +128,11 @@ def replaced(folder: Path) -> Iterator[Path]:
     with tempfile.TemporaryDirectory(dir=folder, prefix=UNFINISHED) as made:
         yield Path(made)
         names = sorted(path.name for path in Path(made).iterdir())
-        earlier = {*RUN_FILES, *map(str, _read_summary(folder).get(WRITTEN, []))} - {
-            *names,
-            SUMMARY,
-        }
+        written = _read_summary(folder).get(WRITTEN)
+        listed = (
+            [one for one in written if isinstance(one, str)] if isinstance(written, list) else []
+        )
+        earlier = {*RUN_FILES, *listed} - {*names, SUMMARY}
         if not _same(Path(made) / SUMMARY, folder / SUMMARY):
             (folder / SUMMARY).unlink(
                 missing_ok=True

@@ -139,6 +139,7 @@ def run_policy(
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Formation], None] | None = None,
     keep_interrupted: bool = False,
+    trust: bool = False,
 ) -> Record:
     """Run a policy over the whole horizon, without early ends (``end_on=()``), and record everything.
 
@@ -156,6 +157,9 @@ def run_policy(
     keep_interrupted
         After an interrupt (Ctrl-C) return a record of what was simulated, marked as interrupted, once there
         is a step; without it the interrupt goes on, so that a part is never taken for the whole.
+    trust
+        Whether code that the scenario names (``"module:factory"``) may be imported. Objects need no
+        permission.
 
     Raises
     ------
@@ -163,7 +167,7 @@ def run_policy(
         for an unknown or invalid option; naming the policy, if its ``predict`` does not return a pair of
         actions (in the right shape) and a state; naming part and factory, for a part that cannot be made.
     """
-    formation = Formation(scenario.model_copy(update={"end_on": ()}), parts)
+    formation = Formation(scenario.model_copy(update={"end_on": ()}), parts, trust=trust)
     formation.reset(checked_seed(seed), start=start_options(options, scenario.robot_count))
     a, steps = formation.arrays, scenario.horizon_steps
     tape, signals = _Tape(a, steps), SignalTape(a, scenario)
@@ -204,6 +208,7 @@ def run_seeds(
     *,
     name: str = "policy",
     most_failed: int | None = None,
+    trust: bool = False,
 ) -> Iterator[Record]:
     """Runs of several seeds side by side, without contact between robots; as :func:`run_policy`.
 
@@ -214,9 +219,11 @@ def run_seeds(
     ----------
     most_failed
         Stop, with no record at all, as soon as robots are lost or touch in more runs than this.
+    trust
+        As of :func:`run_policy`.
     """
     with without_warnings():
-        plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds))
+        plant = BatchPlant(scenario.model_copy(update={"end_on": ()}), len(seeds), trust=trust)
     plant.reset(list(seeds))
     a, steps = plant.arrays, scenario.horizon_steps
     tape = _Tape(a, steps)
@@ -227,7 +234,7 @@ def run_seeds(
         if len(seeds) == 1:
             raise
         for seed in seeds:
-            yield from run_seeds(scenario, policy, [seed], name=name)
+            yield from run_seeds(scenario, policy, [seed], name=name, trust=trust)
         return
     for k in range(1, steps + 1):
         plant.step(actions)

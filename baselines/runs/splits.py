@@ -35,8 +35,11 @@ def check_training(scenario: Scenario) -> None:
     Raises
     ------
     ValueError
-        naming the task or the disturbance that may not.
+        naming the task or the disturbance that may not, or code that the scenario names: the policies that are
+        found are numbers, which must not depend on code.
     """
+    for role, path in scenario.code.items():
+        raise ValueError(f"{role} {path!r} is code, which a training or a search must not name")
     check_training_names(scenario.name, scenario.disturbance.name)
 
 

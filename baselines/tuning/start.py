@@ -11,7 +11,6 @@ from baselines.policies.laws.catalogue import LAWS, law_of, read_law
 from baselines.policies.laws.law import LawFile
 from baselines.policies.systems import (
     ESTIMATORS,
-    PYTHON_ESTIMATORS,
     LimitedLaw,
     SystemName,
     asked_by,
@@ -21,7 +20,7 @@ from tlf_env.common.errors import one_line
 from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 from tlf_env.onboard.limiters import Limiter, behind, load_limiter, own_limiter
-from tlf_env.onboard.parts import Policy
+from tlf_env.onboard.parts import PYTHON_ESTIMATORS, Policy
 from tlf_env.task.scenario import Scenario, load_scenario
 
 SYSTEM_FIELDS = ("estimator", "broadcast_smoothing_s")  # that a system's name sets in a search

@@ -7,8 +7,12 @@ from numbers import Integral, Real
 from typing import Annotated, Any
 
 import numpy as np
-from pydantic import BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
+from pydantic import AfterValidator, BaseModel, BeforeValidator, ConfigDict, Field, FiniteFloat
 from pydantic_core import PydanticCustomError
+
+# No quantity of a robot needs larger numbers, or smaller ones above 0. Products and squares of such numbers are
+# far from the limits of a float, beyond which results are no numbers.
+LARGEST, SMALLEST = 1e15, 1e-15
 
 
 def is_number(value: Any) -> bool:
@@ -27,7 +31,16 @@ def as_float(value: Any) -> float:
 def _number(value: Any) -> float:
     if not is_number(value):
         raise PydanticCustomError("number_type", "Input should be a number")
-    return as_float(value)
+    found = as_float(value)
+    if LARGEST < abs(found) < math.inf:
+        raise PydanticCustomError("number_size", f"Input should be within ±{LARGEST:g}")
+    return found
+
+
+def _not_tiny(value: float) -> float:
+    if 0.0 < value < SMALLEST:
+        raise PydanticCustomError("number_size", f"Input should be at least {SMALLEST:g}")
+    return value
 
 
 def _whole_number(value: Any) -> Any:
@@ -51,7 +64,7 @@ def infinite_if_none(limit: float | None, factor: float = 1.0) -> float:
 
 # Numbers of Python and NumPy. Switches (which Python would take as 1 and 0), texts and arrays are refused.
 Number = Annotated[FiniteFloat, BeforeValidator(_number)]
-Positive = Annotated[Number, Field(gt=0)]
+Positive = Annotated[Number, Field(gt=0), AfterValidator(_not_tiny)]
 NonNegative = Annotated[Number, Field(ge=0)]
 Whole = Annotated[int, BeforeValidator(_whole_number)]
 Switch = Annotated[bool, BeforeValidator(_switch)]

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import itertools
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,12 @@ MOST_VALUES = (
     1_000_000  # in a file, each as often as aliases repeat it; 100 000 waypoints are 400 000
 )
 DECIMAL = r"[-+]?(?:[0-9]+(?:\.[0-9]*)?|\.[0-9]+)(?:[eE][-+]?[0-9]+)?"
+
+# Ends of the files that a file may name, and what separates their names in one text.
+NAMED_SUFFIXES = (*SUFFIXES, ".csv", ".json", ".parquet", ".safetensors", ".zip", ".npz")
+NAMES_A_FILE = ("file", "data")  # keys of waypoints, and of the data of a training
+MOST_NAMED = 300  # characters of a name in an error
+BETWEEN_NAMES = re.compile(r"[,;:+@]")
 
 SENTENCE_END = re.compile(r"(?<=\.) (?=[A-Z`]|docs/)")
 BREAKS = re.compile("[\x85\u2028\u2029]")
@@ -253,6 +260,60 @@ def beside(folder: Path, named: Any) -> Any:
     return str(path) if path.is_file() else named
 
 
+def check_named_files(path: Path, data: Any) -> None:
+    """Check that the files that a file's values name lie in its folder, or in the working directory.
+
+    Links are followed. So a file of others reads nothing that did not come with it, or that lies where the
+    user works.
+
+    Parameters
+    ----------
+    path
+        The file.
+    data
+        Plain data. A text, or what is between commas, colons, ``+`` and ``@`` in it, names a file if it ends as
+        one, and always as the value of a key in :data:`NAMES_A_FILE`.
+
+    Raises
+    ------
+    ValueError
+        in one line that names the file, and what it names.
+    """
+    folders = [path.resolve().parent, Path.cwd()]
+    for text, is_file in _texts(data):
+        for named in {text, *BETWEEN_NAMES.split(text)}:
+            name = named.strip()
+            if not (is_file or name.lower().endswith(NAMED_SUFFIXES)):
+                continue
+            for start in folders:
+                try:
+                    found = (start / name).resolve()
+                except (
+                    OSError,
+                    RuntimeError,
+                    ValueError,
+                ):  # a loop of links, a character that none has
+                    continue
+                if not any(folder in found.parents for folder in folders):
+                    raise ValueError(
+                        f"{path_text(path)} names {path_text(name[-MOST_NAMED:])}, which lies neither in its "
+                        "folder nor in the working directory"
+                    )
+
+
+def _texts(data: Any, is_file: bool = False) -> Iterator[tuple[str, bool]]:
+    """All texts in plain data, keys included, and whether each is the value of a key of a file."""
+    if isinstance(data, str):
+        yield data, is_file
+    elif isinstance(data, dict):
+        for key, value in data.items():
+            yield from _texts(key)
+            yield from _texts(value, key in NAMES_A_FILE)
+    elif isinstance(data, list | tuple):
+        for one in data:
+            yield from _texts(one, is_file)
+
+
 def read_preset_or_file(kind: str, source: str | Path, others: str = "") -> dict[str, Any]:
     """The mapping of a preset, by its name, or of a YAML file, by its path.
 
@@ -268,11 +329,15 @@ def read_preset_or_file(kind: str, source: str | Path, others: str = "") -> dict
     Raises
     ------
     ValueError
-        in one line, if the source is neither, or as :func:`read_yaml`.
+        in one line, if the source is neither, or as :func:`read_yaml` and, for a file,
+        :func:`check_named_files`.
     """
     path = preset_or_file(kind, str(source))
     if path is not None:
-        return read_yaml(path)
+        found = read_yaml(path)
+        if is_file_name(source):
+            check_named_files(path, found)
+        return found
     names = preset_names(kind)
     raise ValueError(
         f"{kind} {shown(str(source))} is not one of {', '.join(names)}, nor a .yaml file{others}"

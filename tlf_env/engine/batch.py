@@ -68,6 +68,9 @@ class BatchPlant:
         How many work on a step; None takes one for each core.
     mixture
         True, or a share for each scenario: every episode of a formation draws its scenario, by its seed.
+    trust
+        Whether a policy that ``residual_base`` names (``"module:factory"``) may be imported; a policy that is
+        given as an object needs no permission.
     staggered
         Whether a reset of all formations spreads the ends of their episodes: that of formation k ends
         after (k + 1)/formations of the horizon, the later ones at the horizon. For learners: otherwise
@@ -97,6 +100,7 @@ class BatchPlant:
         mixture: bool | Sequence[float] = False,
         staggered: bool = False,
         precision: str = DOUBLE,
+        trust: bool = False,
         **overrides: Any,
     ) -> None:
         if precision not in PRECISIONS:
@@ -115,7 +119,7 @@ class BatchPlant:
         self.threads = checked_count("threads", os.cpu_count() or 1 if threads is None else threads)
         table = reference_table(self.scenario)
         self.arrays: Arrays = make_arrays(self.scenarios, table, self.formations)
-        self._base = make_base(self.scenario, base)
+        self._base = make_base(self.scenario, base, trust=trust)
         self._variants = make_variants(self.scenarios, _shares(mixture, len(self.scenarios)))
         each = [make_settings(one) for one in self.scenarios]
         self._settings = each[0]._replace(
@@ -454,7 +458,9 @@ class BatchPlant:
         if len(shares) and (shares[-1] != 1.0 or shares[0] < 0.0 or (np.diff(shares) < 0.0).any()):
             raise ValueError("the snapshot is damaged: its shares of the scenarios do not sum to 1")
         counts = len(self.scenarios), len(phases_s)
-        found = checked_arrays(state, self.arrays, self.scenario, counts)
+        found = checked_arrays(
+            state, self.arrays, self._variants, self.scenario, counts, more["seeded"]
+        )
         if self._base is not None:
             self._base.set_state(state.tree("base"), state.numbers)
         self._follow_from(phases_s)

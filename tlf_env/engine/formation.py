@@ -105,12 +105,17 @@ class Formation:
 
     Units: mm, s, rad; arrays are views that the next step overwrites. ``parts`` gives factories for
     the ``estimator``, ``wheel_loop`` or ``observer`` that the scenario names, if they are given
-    as objects; the others are imported by name. ``base`` is the policy that ``residual_base`` names, if it
-    is given as an object.
+    as objects; the others are imported by name, if ``trust`` is True. ``base`` is the policy that
+    ``residual_base`` names, if it is given as an object.
     """
 
     def __init__(
-        self, scenario: Scenario, parts: Mapping[str, Factory] | None = None, base: Any = None
+        self,
+        scenario: Scenario,
+        parts: Mapping[str, Factory] | None = None,
+        base: Any = None,
+        *,
+        trust: bool = False,
     ) -> None:
         self.scenario = scenario
         self._table = reference_table(scenario)
@@ -118,8 +123,8 @@ class Formation:
         self._variants = make_variants([scenario])
         kind = ChipmunkPlant if scenario.plant == "chipmunk" else PymunkPlant
         self.plant = kind(scenario.robot_models, scenario.world, scenario.control_period_s)
-        self._base = make_base(scenario, base)
-        self._parts = Parts(part_factories(scenario, parts or {}), scenario)
+        self._base = make_base(scenario, base, trust=trust)
+        self._parts = Parts(part_factories(scenario, parts or {}, trust=trust), scenario)
         self._settings = make_settings(scenario)
         self._packed = packed(self._settings)
         # Settings of a step that goes substep by substep though no part is outside.
@@ -237,7 +242,7 @@ class Formation:
         arrays, phase_s = self.arrays, state.tree("phase_s")
         if not isinstance(phase_s, float):
             raise ValueError(f"the snapshot is damaged: its phase is {shown(phase_s)}")
-        found = checked_arrays(state, arrays, self.scenario, (1, 1))
+        found = checked_arrays(state, arrays, self._variants, self.scenario, (1, 1), ALONE)
         space = state.part("space", self.plant.state_layout())
         try:
             self.plant.check_state(space)

@@ -32,24 +32,26 @@ def separate_base(overrides: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
     return {**overrides, ROLE: part_name(named)}, base
 
 
-def make_base(scenario: Scenario, given: Any = None) -> OutsideBase | None:
+def make_base(scenario: Scenario, given: Any = None, *, trust: bool) -> OutsideBase | None:
     """The base of a scenario that is a policy in Python; None if its base is a controller.
 
     Parameters
     ----------
     given
         The policy, or a factory of it; None: what the scenario names is imported.
+    trust
+        As of :func:`~tlf_env.onboard.parts.check_trust`.
 
     Raises
     ------
     ValueError
-        for a policy that cannot be imported or made, or that has no ``predict``.
+        for a policy that cannot or may not be imported, cannot be made, or has no ``predict``.
     """
     path = scenario.outside_base
     if path is None:
         return None
     if given is None:
-        return OutsideBase(path, make_part(ROLE, path, load_part(path)))
+        return OutsideBase(path, make_part(ROLE, path, load_part(ROLE, path, trust=trust)))
     return OutsideBase(path, make_part(ROLE, path, given if callable(given) else lambda: given))
 
 

@@ -37,16 +37,20 @@ MOVED = [Trace._fields.index(name) for name in ("moved", "turned")]
 NIS = Trace._fields.index("nis")
 
 
-def part_factories(scenario: Scenario, at_hand: Mapping[str, Factory]) -> dict[str, Factory]:
+def part_factories(
+    scenario: Scenario, at_hand: Mapping[str, Factory], *, trust: bool
+) -> dict[str, Factory]:
     """Factories of the parts that a scenario names; those not in ``at_hand`` are imported.
 
     Raises
     ------
     ValueError
-        for a part that cannot be imported.
+        for a part that cannot be imported, or may not be: ``trust`` is as of
+        :func:`~tlf_env.onboard.parts.check_trust`.
     """
     return {
-        role: at_hand.get(role) or load_part(path) for role, path in scenario.part_paths.items()
+        role: at_hand.get(role) or load_part(role, path, trust=trust)
+        for role, path in scenario.part_paths.items()
     }
 
 

@@ -20,9 +20,12 @@ from safetensors.numpy import save
 import tlf_env
 from tlf_env.common.errors import path_text, shown
 from tlf_env.common.files import atomic, parse_json
-from tlf_env.engine.arrays import FROM_SCENARIO, Arrays
+from tlf_env.common.models import LARGEST
+from tlf_env.engine.arrays import FROM_SCENARIO, Arrays, Variants
+from tlf_env.engine.layout import BY_NAME, in_array
 from tlf_env.numerics.compiled import simulation_digest
 from tlf_env.onboard.memory import packed, unpacked
+from tlf_env.physics.parameters import Mass
 from tlf_env.task.info import EndReason, TouchedBy
 from tlf_env.task.scenario import Scenario
 
@@ -32,6 +35,13 @@ Layout = Mapping[
     str, tuple[Any, tuple[int | None, ...]]
 ]  # dtype and shape, None where any length fits
 
+
+# Rows of an episode's constants that its start changes, and those of their fields whose sign may change, too.
+CHANGED_AT_START = {
+    "body": Mass._fields,
+    **{name: BY_NAME[name].fields._fields for name in ("belief", "slip_ekf", "gyro_ekf")},
+}
+MAY_CHANGE_SIGN = ("d", "q", "w_ef", "outline_ahead")
 
 # Arrays that may hold NaN: no value was set there.
 UNDEFINED = ("imposed", "infos")  # NaN: not imposed, not computed
@@ -163,13 +173,13 @@ class Snapshot:
         layout
             Their names, dtypes and shapes.
         undefined
-            Names of those that may hold numbers that are not finite.
+            Names of those that may hold NaN.
 
         Raises
         ------
         ValueError
             in one line, for an array that is missing or of another dtype or shape, or for a number that is
-            not finite.
+            not finite, or so large that no episode has it.
         """
         found = {}
         for key, (dtype, shape) in layout.items():
@@ -183,8 +193,12 @@ class Snapshot:
             if array.ndim != len(shape) or any(n is not None and m != n for m, n in sizes):
                 wanted = tuple("any" if n is None else n for n in shape)
                 raise ValueError(f"{what} has the shape {array.shape}, not {wanted}")
-            if array.dtype.kind == "f" and key not in undefined and not np.isfinite(array).all():
-                raise ValueError(f"{what} has a number that is not finite")
+            if array.dtype.kind == "f":
+                known = array[~np.isnan(array)] if key in undefined else array
+                if not np.isfinite(known).all():
+                    raise ValueError(f"{what} has a number that is not finite")
+                if (np.abs(known) > LARGEST).any():
+                    raise ValueError(f"{what} has a number beyond ±{LARGEST:g}")
             found[key] = array
         return found
 
@@ -353,14 +367,23 @@ def array_numbers(arrays: Arrays) -> dict[str, np.ndarray]:
 
 
 def checked_arrays(
-    snapshot: Snapshot, arrays: Arrays, scenario: Scenario, counts: tuple[int, int]
+    snapshot: Snapshot,
+    arrays: Arrays,
+    variants: Variants,
+    scenario: Scenario,
+    counts: tuple[int, int],
+    started: np.ndarray,
 ) -> dict[str, np.ndarray]:
     """The arrays of a snapshot that are to replace those in ``arrays``.
 
     Parameters
     ----------
+    variants
+        Constants of the scenarios that lanes may run.
     counts
         How many scenarios and tables of the reference there are.
+    started
+        ``(lane,)``: the formations that have begun an episode.
 
     Raises
     ------
@@ -390,7 +413,34 @@ def checked_arrays(
         raise ValueError(
             "the snapshot is damaged: its episode has a step, seed or number out of range"
         )
+    _check_constants(found["constants"], variants.constants, found["variants"], started)
     return found
+
+
+def _check_constants(
+    found: np.ndarray, scenarios: np.ndarray, variants: np.ndarray, started: np.ndarray
+) -> None:
+    """Check an episode's constants against those of its scenario, (field, robot, lane) and variant.
+
+    The start of an episode changes what a payload, calibration and the period of fixes change, and nothing of
+    it from above 0 to 0 or below.
+
+    Raises
+    ------
+    ValueError
+        for constants that the scenario cannot have.
+    """
+    lanes = np.flatnonzero(started)
+    here, there = found[:, :, lanes], scenarios[:, :, variants[lanes]]
+    same = here == there
+    for name, fields in CHANGED_AT_START.items():
+        first = in_array(name)
+        part = slice(first, first + len(fields))
+        same[part] |= (here[part] > 0.0) | (there[part] <= 0.0)
+    for field in MAY_CHANGE_SIGN:
+        same[in_array("body", field)] = True
+    if not same.all():
+        raise ValueError("the snapshot is damaged: its robots have constants of another scenario")
 
 
 def put_arrays(arrays: Arrays, found: Mapping[str, np.ndarray]) -> None:

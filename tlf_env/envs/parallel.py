@@ -66,6 +66,9 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         apply in that step, e.g. ``{"slip.delta_1_mm_s": 20.0}``.
     infos
         Whether :meth:`reset` and :meth:`step` return infos; or a sequence of the keys to return.
+    trust
+        Whether code that the scenario names (``"module:factory"``) may be imported. Objects need no
+        permission.
     **overrides
         Fields of the scenario; ``disturbance_level`` too.
 
@@ -84,6 +87,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         adversary: Adversary | None = None,
         infos: InfoChoice = True,
+        trust: bool = False,
         **overrides: Any,
     ) -> None:
         overrides, base = separate_base(overrides)
@@ -109,7 +113,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         self.render_mode = render_mode
         self.possible_agents = [f"robot_{i}" for i in range(self.scenario.robot_count)]
         self.agents: list[Agent] = []
-        self._formation = Formation(self.scenario, parts, base)
+        self._formation = Formation(self.scenario, parts, base, trust=trust)
         # Channels that stay for a whole episode are taken from its first infos.
         self._varying = np.array(
             [
@@ -474,11 +478,17 @@ def parallel_env(
     render_mode: str | None = None,
     adversary: Adversary | None = None,
     infos: InfoChoice = True,
+    trust: bool = False,
     **overrides: Any,
 ) -> FormationParallelEnv:
     """Make the parallel environment; see :class:`FormationParallelEnv`."""
     return FormationParallelEnv(
-        scenario, render_mode=render_mode, adversary=adversary, infos=infos, **overrides
+        scenario,
+        render_mode=render_mode,
+        adversary=adversary,
+        infos=infos,
+        trust=trust,
+        **overrides,
     )
 
 

@@ -73,6 +73,9 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         :meth:`reset` and :meth:`step`, at most in real time).
     infos
         Whether :meth:`reset` and :meth:`step` return infos; or a sequence of the keys to return.
+    trust
+        Whether code that ``others`` or the scenario names (``"module:factory"``) may be imported. Objects need
+        no permission.
     **overrides
         Fields of the scenario; ``disturbance_level`` too. ``action`` is ``"tracking_twist"`` unless it, or
         the scenario's file or mapping, says otherwise; a :class:`~tlf_env.task.scenario.Scenario` keeps
@@ -96,12 +99,14 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         others: str | Policy = BY_REFERENCE,
         render_mode: str | None = None,
         infos: InfoChoice = True,
+        trust: bool = False,
         **overrides: Any,
     ) -> None:
         self.formation_env = FormationParallelEnv(
             scenario,
             render_mode=render_mode,
             infos=infos,
+            trust=trust,
             **learners_action(scenario, overrides),
         )
         agents = self.formation_env.possible_agents
@@ -115,7 +120,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space = self.formation_env.observation_space(learner)
         self.action_space = self.formation_env.action_space(learner)
         self._rest = [i for i, agent in enumerate(agents) if agent != learner]
-        self._driver = self._make_driver(others)
+        self._driver = self._make_driver(others, trust)
         self._others = others if isinstance(others, str) else part_name(type(others))
         self._driver_state: Any = None
         kinds = self.formation_env.formation.arrays.kinds
@@ -126,7 +131,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         }
 
     @staticmethod
-    def _make_driver(others: str | Policy) -> Policy | None:
+    def _make_driver(others: str | Policy, trust: bool) -> Policy | None:
         if others == BY_REFERENCE:
             return None
         driver: Any = others
@@ -135,7 +140,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
                 raise ValueError(
                     f"others {others!r} must be {BY_REFERENCE!r}, 'module:factory' or an object"
                 )
-            driver = make_part("others", others, load_part(others))
+            driver = make_part("others", others, load_part("others", others, trust=trust))
         if isinstance(driver, type) or not hasattr(driver, "predict"):
             raise ValueError(f"others {driver!r} has no predict()")
         return cast(Policy, driver)

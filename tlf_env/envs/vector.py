@@ -85,6 +85,8 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         ``horizon_s`` is given, too.
     infos
         Whether steps return infos; or a sequence of the keys to return.
+    trust
+        As in :class:`~tlf_env.engine.batch.BatchPlant`.
     render_mode
         None.
     **overrides
@@ -114,6 +116,7 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         infos: InfoChoice = True,
+        trust: bool = False,
         **overrides: Any,
     ) -> None:
         if "formations" in overrides:
@@ -127,6 +130,7 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             mixture=mixture,
             staggered=staggered,
             precision=precision,
+            trust=trust,
             **learners_action(scenario, overrides),
         )
         self._info_keys = chosen_keys(infos)

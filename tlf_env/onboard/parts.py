@@ -3,6 +3,9 @@
 A part is made by a *factory*, for each robot and again at every reset. A factory is a class, a function,
 or the string ``"module:factory"``. It is called as ``factory(robot, period_s)`` with the robot's
 :class:`~tlf_env.physics.vehicle.RobotParameters` and the period (s) at which the part runs.
+
+A string may come from a file, so that a module is imported only if the caller allows it (``trust=True``). An
+object is code of the caller and needs no permission.
 """
 
 from __future__ import annotations
@@ -12,7 +15,7 @@ import inspect
 import math
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple, Protocol
 
@@ -24,6 +27,12 @@ from tlf_env.onboard.observer import Message, Reference
 
 PART_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_<][\w.<>]*$"  # <locals>, <lambda>: given as objects
 Factory = Callable[..., Any]
+
+# Estimators in Python that are shipped with the package, by their names in systems. They need no permission.
+PYTHON_ESTIMATORS = {
+    "ukf": "baselines.policies.estimators.unscented:UnscentedEstimator",
+    "moving-horizon": "baselines.policies.estimators.moving_horizon:MovingHorizonEstimator",
+}
 
 # Methods of each role, with their arguments.
 METHODS: dict[str, dict[str, tuple[str, ...]]] = {
@@ -105,18 +114,52 @@ class Policy(Protocol):
         """Actions for a batch of observations, and the next state."""
 
 
-def load_part(path: str) -> Factory:
-    """The object that ``"module:factory"`` names; modules in the working directory are found too.
+def check_trust(code: Mapping[str, str], trust: bool) -> None:
+    """Check that the modules of some parts may be imported.
+
+    Parameters
+    ----------
+    code
+        ``"module:factory"`` by role.
+    trust
+        Whether the user allows code of any module; :data:`PYTHON_ESTIMATORS` are always allowed.
 
     Raises
     ------
     ValueError
-        in one line, if there is no such module or name, or the module raises any error when it is
-        imported.
+        in one line that names the first part and how to allow it.
     """
+    if not isinstance(trust, bool):
+        raise ValueError(f"trust {shown(trust)} must be True or False")
+    for role, path in code.items():
+        if not trust and path not in PYTHON_ESTIMATORS.values():
+            raise ValueError(
+                f"{role} {path!r} runs code of the module {path.partition(':')[0]!r}; allow that with "
+                "--trust, in Python with trust=True"
+            )
+
+
+def load_part(role: str, path: str, *, trust: bool) -> Factory:
+    """The object that ``"module:factory"`` names; modules in the working directory are found too.
+
+    Parameters
+    ----------
+    role
+        What the part is for, for errors.
+    trust
+        As of :func:`check_trust`.
+
+    Raises
+    ------
+    ValueError
+        in one line, if it may not be imported, if there is no such module or name, or the module raises
+        any error when it is imported.
+    """
+    check_trust({role: path}, trust)
     module_name, _, name = path.partition(":")
     here = str(Path.cwd())
-    added = here not in sys.path
+    # A file of the same name in the working directory must not take the place of a shipped module.
+    added = here not in sys.path and path not in PYTHON_ESTIMATORS.values()
     if added:
         sys.path.insert(0, here)
     try:

@@ -16,6 +16,18 @@ from tlf_env.common.models import Frozen, NonNegative, Number, Positive, Switch
 from tlf_env.numerics.compiled import law
 from tlf_env.physics.units import MILLINEWTON_PER_NEWTON
 
+# Far beyond any robot, and near enough that products of all of them stay finite.
+Length = Annotated[Positive, Field(ge=1e-3, le=1e6)]  # mm
+Lever = Annotated[NonNegative, Field(le=1e6)]  # mm
+Offset = Annotated[Number, Field(ge=-1e6, le=1e6)]  # mm
+BodyMass = Annotated[Positive, Field(ge=1e-6, le=1e6)]  # kg
+Inertia = Annotated[Positive, Field(ge=1e-6, le=1e15)]  # kg·mm²
+Speed = Annotated[Positive, Field(ge=1e-6, le=1e6)]  # mm/s
+Acceleration = Annotated[Positive, Field(ge=1e-3, le=1e7)]  # mm/s²
+Coefficient = Annotated[NonNegative, Field(le=1e3)]
+TorqueLimit = Annotated[Positive, Field(ge=1e-6, le=1e9)]  # N·mm
+Preload = Annotated[NonNegative, Field(le=1e9)]  # N·mm
+
 LOAD_SPLIT_TOLERANCE = 1e-9
 CONVEX_TOLERANCE = 1e-9
 
@@ -44,10 +56,10 @@ class FrictionCurve(Frozen):
     ``dynamic_speed_mm_s`` (v_d). At zero speed the law is set-valued: true stiction.
     """
 
-    mu_static: NonNegative
-    mu_dynamic: NonNegative
-    stiction_speed_mm_s: Positive
-    dynamic_speed_mm_s: Positive
+    mu_static: Coefficient
+    mu_dynamic: Coefficient
+    stiction_speed_mm_s: Speed
+    dynamic_speed_mm_s: Speed
 
     @model_validator(mode="after")
     def _check(self) -> Self:
@@ -66,10 +78,10 @@ class FrictionCurve(Frozen):
 class JointFriction(FrictionCurve):
     """Friction torque of a revolute joint, eq. (5), with the on/off settings of Table I."""
 
-    friction_arm_mm: NonNegative  # R_n, lever of the axial force
-    pin_radius_mm: NonNegative  # R_p, lever of the radial force
-    bending_arm_mm: Positive  # R_b, divides the bending moment
-    preload_Nmm: NonNegative = 0.0  # T_pre; off in Table I
+    friction_arm_mm: Lever  # R_n, lever of the axial force
+    pin_radius_mm: Lever  # R_p, lever of the radial force
+    bending_arm_mm: Length  # R_b, divides the bending moment
+    preload_Nmm: Preload = 0.0  # T_pre; off in Table I
     bending: Switch = True  # friction from the bending moment; on in Table I
 
 
@@ -103,34 +115,34 @@ class RobotParameters(Frozen):
     """
 
     # Table I
-    mass_kg: Positive = 1.245
-    wheel_radius_mm: Positive = 50.0
-    axle_width_mm: Positive = 156.0
-    wheel_inertia_kg_mm2: Positive = 52.91
-    gravity_mm_s2: Positive = 9807.0
+    mass_kg: BodyMass = 1.245
+    wheel_radius_mm: Length = 50.0
+    axle_width_mm: Length = 156.0
+    wheel_inertia_kg_mm2: Inertia = 52.91
+    gravity_mm_s2: Acceleration = 9807.0
     # Section II-B: 0.8 of the weight on the drive wheels, 0.2 on the castor
     drive_load_share: Annotated[Number, Field(gt=0, le=0.5)] = 0.4
     castor_load_share: Annotated[Number, Field(ge=0, lt=1)] = 0.2
     # chosen
-    body_inertia_kg_mm2: Positive = 6197.0
-    com_offset_mm: NonNegative = 20.0
-    castor_pivot_mm: Positive = 85.0
-    castor_trail_mm: Positive = 15.0
-    castor_radius_mm: Positive = 20.0
-    castor_inertia_kg_mm2: Positive = 4.0
-    fork_inertia_kg_mm2: Positive = 20.0
+    body_inertia_kg_mm2: Inertia = 6197.0
+    com_offset_mm: Lever = 20.0
+    castor_pivot_mm: Length = 85.0
+    castor_trail_mm: Length = 15.0
+    castor_radius_mm: Length = 20.0
+    castor_inertia_kg_mm2: Inertia = 4.0
+    fork_inertia_kg_mm2: Inertia = 20.0
     # The outline is a circle, or a convex polygon with corners (right, forward of c); then radius and offset
     # are those of a circle around it.
-    outline_radius_mm: Positive = 110.0
-    outline_offset_mm: Number = 30.0  # centre of the outline's circle, behind c
+    outline_radius_mm: Length = 110.0
+    outline_offset_mm: Offset = 30.0  # centre of the outline's circle, behind c
     outline_polygon_mm: (
-        Annotated[tuple[tuple[Number, Number], ...], Field(min_length=3, max_length=100)] | None
+        Annotated[tuple[tuple[Offset, Offset], ...], Field(min_length=3, max_length=100)] | None
     ) = None
     # A contact has the product of both surfaces' values, as in Chipmunk.
     outline_restitution: Annotated[Number, Field(ge=0, le=1)] = 0.0
-    outline_friction: NonNegative = 0.0  # coefficient of Coulomb friction
+    outline_friction: Coefficient = 0.0  # coefficient of Coulomb friction
     # footnote 4
-    torque_limit_Nmm: Positive = 15.0
+    torque_limit_Nmm: TorqueLimit = 15.0
     # Table I; it does not give the tyres' v_d: 1.5 v_s, as for the joints
     tyre: FrictionCurve = FrictionCurve(
         mu_static=0.073, mu_dynamic=0.055, stiction_speed_mm_s=2.0, dynamic_speed_mm_s=3.0

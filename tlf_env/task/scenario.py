@@ -422,6 +422,12 @@ class Scenario(Frozen):
         return self.residual_base if is_part(self.residual_base) else None
 
     @property
+    def code(self) -> dict[str, str]:
+        """All code that the scenario names, ``module:factory`` by field."""
+        base = self.outside_base
+        return self.part_paths if base is None else {**self.part_paths, "residual_base": base}
+
+    @property
     def privileged(self) -> bool:
         """Whether observations use the true state."""
         return self.estimator == "truth"

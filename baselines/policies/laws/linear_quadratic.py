@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from typing import Annotated
+
 import numpy as np
+from pydantic import Field
 
 from baselines.policies.laws.law import UNBOUNDED, ErrorBounds, LawFile, Memoryless, angles
 from tlf_env.common.models import Positive
@@ -11,17 +14,21 @@ from tlf_env.onboard.rays import Rays
 from tlf_env.onboard.supervisor import Neighbour
 from tlf_env.task.scenario import DEFAULT_PREVIEW_S
 
+MOST_STEPS = 100_000  # of the recursion, for each action
+# The recursion divides by the squares of the tolerances: much smaller or larger ones are lost in rounding.
+Tolerance = Annotated[Positive, Field(ge=1e-5, le=1e6)]
+
 
 class LinearQuadraticFile(LawFile):
     """Parameters of :class:`LinearQuadratic` in a file; None: its default."""
 
-    forward_mm: Positive | None = None
-    lateral_mm: Positive | None = None
-    heading_rad: Positive | None = None
-    speed_mm_s: Positive | None = None
-    yaw_rate_rad_s: Positive | None = None
+    forward_mm: Tolerance | None = None
+    lateral_mm: Tolerance | None = None
+    heading_rad: Tolerance | None = None
+    speed_mm_s: Tolerance | None = None
+    yaw_rate_rad_s: Tolerance | None = None
     horizon_s: Positive | None = None
-    step_s: Positive | None = None
+    step_s: Annotated[Positive, Field(le=1.0)] | None = None
 
 
 class LinearQuadratic(Memoryless):
@@ -53,7 +60,7 @@ class LinearQuadratic(Memoryless):
     Raises
     ------
     ValueError
-        if the horizon is shorter than a step.
+        if the horizon is shorter than a step, or longer than :data:`MOST_STEPS` of them.
     """
 
     def __init__(
@@ -73,6 +80,10 @@ class LinearQuadratic(Memoryless):
         super().__init__(preview_s, rays, neighbour, bounds)
         if horizon_s < step_s:
             raise ValueError(f"horizon_s {horizon_s:g} must be at least step_s {step_s:g}")
+        if horizon_s / step_s > MOST_STEPS:
+            raise ValueError(
+                f"horizon_s {horizon_s:g} must be at most {MOST_STEPS} steps of step_s {step_s:g}"
+            )
         self.error_weights = np.array([forward_mm, lateral_mm, heading_rad]) ** -2.0
         self.correction_weights = np.array([speed_mm_s, yaw_rate_rad_s]) ** -2.0
         self.step_s, self.steps = step_s, round(horizon_s / step_s)
