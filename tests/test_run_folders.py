@@ -20,7 +20,7 @@ from baselines.pages.runs import write_index
 from baselines.policies.registry import fit_policy
 from baselines.runs import run as runs
 from baselines.runs.files import read_record
-from baselines.runs.folders import FIGURES, RUN_FILES, Identity, make_room
+from baselines.runs.folders import FIGURES, RUN_FILES, Identity, check_room, replaced
 from baselines.runs.run import RECORDED, run_policy
 from baselines.runs.signals import ACTIONS, OBSERVATION, SIGNALS
 from tlf_env import parallel_env
@@ -381,9 +381,11 @@ def test_a_damaged_list_of_files_does_not_stop_a_run(written, tmp_path):
     Path("x").touch()
     identity = Identity("0", "a", None, 0, "{}")
     Path("here/summary.json").write_text(json.dumps({"identity": list(identity), "files": written}))
-    make_room(Path("here"), identity, overwrite=False)
+    check_room(Path("here"), identity, overwrite=False)
+    with replaced(Path("here")) as made:
+        (made / "summary.json").write_text("{}")
     assert Path("x").exists()
-    assert not Path("here/summary.json").exists()
+    assert Path("here/summary.json").read_text() == "{}"
 
 
 def test_a_run_whose_scenario_is_wrong_is_refused_in_one_line(monkeypatch):

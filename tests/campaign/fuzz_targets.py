@@ -35,7 +35,7 @@ from baselines.policies.laws.catalogue import LAWS
 from baselines.policies.learned import SHIPPED, LearnedPolicy
 from baselines.policies.registry import fit_policy, make_policy, policy_names
 from baselines.runs.files import read_record
-from baselines.runs.folders import Identity, make_room
+from baselines.runs.folders import Identity, check_room
 from baselines.runs.jsonl import read_lines
 from baselines.runs.run import run_policy
 from baselines.training.config import load_config
@@ -1479,7 +1479,7 @@ def results(case: Any) -> None:
         if found is not REFUSED:
             finite("times of a record", found.t_s)
         identity = Identity("0" * 12, "reference", None, 0, "{}")
-        refused(lambda: make_room(folder, identity, overwrite=False))
+        refused(lambda: check_room(folder, identity, overwrite=False))
 
 
 @functools.cache
