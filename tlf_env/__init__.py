@@ -100,6 +100,6 @@ def _register_with_pettingzoo() -> None:
             )
 
 
-# Nobody can ask them for a task before they are imported.
+# A task can be asked for only once they are imported.
 when_imported("gymnasium", _register_with_gymnasium)
 when_imported("pettingzoo", _register_with_pettingzoo)

@@ -104,7 +104,7 @@ PEERS: dict[str, Peer] = {
                 step="0.1 s",
                 substeps="1",
                 sensors="lidar of 16 beams (default 200), each looked up at 120 points; no noise",
-                contacts="found with walls and robots; who touches stays",
+                contacts="found with walls and robots; a robot that touches stays where it is",
                 controllers="none",
             ),
             packages=("jaxmarl", "jax"),

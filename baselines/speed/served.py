@@ -132,7 +132,9 @@ def main() -> None:
     serve(
         sys.stdin,
         answers,
-        lambda: Server(factory, int(robots), int(threads), packages.split(",")),
+        lambda: Server(
+            factory, int(robots), int(threads), [one for one in packages.split(",") if one]
+        ),
     )
 
 

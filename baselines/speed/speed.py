@@ -60,7 +60,7 @@ def measure(
 ) -> dict[str, Any]:
     """Time all environments in turn, ``repeats`` times, so that a disturbance affects all of them alike.
 
-    Peers in JAX or Bullet run in processes of their own, as their libraries are told once for all how many
+    Peers in JAX or Bullet run in processes of their own, as their libraries read only once how many
     threads they have, and may need other versions than ours.
 
     Parameters
@@ -94,8 +94,8 @@ def measure(
         the repeats; an agent step is one step of one robot), ``ratios`` (medians over the
         repeats of ours to a peer's agent steps), ``scaling`` (cost of a step against the number of
         robots), ``parts`` (µs of a formation's control step), ``memory_per_formation_bytes`` (of our arrays),
-        ``compiled`` (processor time that compiling the steps of a peer took, s), ``left_out`` (a line for each peer that was
-        not measured), and ``memory``, ``starts`` and ``training`` where these were asked for.
+        ``compiled`` (processor time that compiling the steps of a peer took, s), ``left_out`` (a line for each
+        peer that was not measured), and ``memory``, ``starts`` and ``training`` where these were asked for.
 
     Raises
     ------
