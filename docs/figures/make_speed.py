@@ -278,7 +278,7 @@ def written(text: str, result: dict[str, Any]) -> str:
 
 def speed(result: dict[str, Any]) -> Figure:
     """Agent steps per second against the number of formations."""
-    figure = Figure(figsize=(6.4, 4.2), layout="constrained")
+    figure = Figure(figsize=(6.4, 5.4), layout="constrained")
     axes = figure.subplots()
     lines = [
         (VECTOR, 3, 1, BLUE, "-", "o", "tlf_env, 3 robots"),
@@ -333,7 +333,7 @@ def speed(result: dict[str, Any]) -> Figure:
     axes.grid(which="major", color="0.9", lw=0.6)
     axes.set_xlabel("formations")
     axes.set_ylabel("agent steps per second (1/s)")
-    axes.legend(frameon=False, fontsize=9, loc="upper left")
+    figure.legend(loc="outside lower center", ncols=2, frameon=False, fontsize=9)
     return figure
 
 
