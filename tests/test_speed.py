@@ -415,17 +415,18 @@ def test_a_scan_takes_the_steps_that_a_loop_takes():
     drive = spread_drive(3, 2, 1, 4)
     (state, _), (keys, actions) = drive.carry, drive.inputs
     env = jaxmarl.make("MPE_simple_spread_v3", num_agents=3, action_type="Continuous")
+    step = jax.jit(env.step_env)
     total = 0.0
     ends = []
     for lane in range(2):
         one = jax.tree_util.tree_map(lambda x, lane=lane: x[lane], state)
         for k in range(4):
             action = {agent: one_of[k, lane] for agent, one_of in actions.items()}
-            observations, one, rewards, _, _ = env.step_env(keys[k, lane], one, action)
+            observations, one, rewards, _, _ = step(keys[k, lane], one, action)
             total += sum(float(x.sum()) for x in (*observations.values(), *rewards.values()))
         ends.append(np.asarray(one.p_pos))
     assert drive(4) > 0
-    (state, carried), *_ = drive.run((state, 0.0 * drive.carry[1]), drive.inputs), None
+    state, carried = drive.run((state, 0.0 * drive.carry[1]), drive.inputs)
     assert np.allclose(state.p_pos, ends, atol=1e-5)
     assert float(carried) == pytest.approx(total, rel=1e-4)
 
