@@ -60,7 +60,7 @@ def test_the_workflow_runs_every_check() -> None:
 def test_the_extra_all_has_everything_but_torch() -> None:
     (everything,) = (one for one in OURS if "train" not in one.extras)
     with_torch = {"train", "benchmarl", "peers"}  # these install it
-    others = {"dev", "docs", "browser", "ray", "all", "all-train"}
+    others = {"dev", "docs", "browser", "peers-jax", "ray", "all", "all-train"}
     assert everything.extras == set(EXTRAS) - with_torch - others
     (with_training,) = (one for one in OURS if "train" in one.extras)
     assert with_training.extras == {"all", "train"}

@@ -43,17 +43,41 @@ def speed(
     ] = "1,32,1024,8192",
     threads: Annotated[str, typer.Option(help="Threads, comma-separated.")] = "1,2",
     peers: Annotated[
-        bool, typer.Option(help="Measure mpe2 and VMAS, too, if they are installed.")
+        bool, typer.Option(help="Measure other environments, too, that are installed.")
     ] = True,
+    peer_python: Annotated[
+        list[str] | None,
+        typer.Option(
+            metavar="NAME=PYTHON",
+            help="The Python of jaxmarl, kheperax or gym-pybullet-drones, if it is not this one; repeatable.",
+        ),
+    ] = None,
     parts: Annotated[bool, typer.Option(help="Measure the parts of a step.")] = True,
+    memory: Annotated[
+        bool, typer.Option("--memory", help="Measure the memory of a formation, too: minutes.")
+    ] = False,
+    cold: Annotated[
+        bool,
+        typer.Option(
+            "--cold", help="Measure starts, too, ours also without compiled drivers: minutes."
+        ),
+    ] = False,
+    training: Annotated[
+        bool,
+        typer.Option("--training", help="Time a training, too: minutes; needs the extra train."),
+    ] = False,
     out: Annotated[Path | None, typer.Option(help="Write the JSON to this file, too.")] = None,
 ) -> None:
-    """Measure steps per second, ours and of mpe2 and VMAS; JSON on stdout, a table on stderr."""
+    """Measure steps per second, ours and of other environments; JSON on stdout, a table on stderr."""
     from baselines.commands.compile import compile_before_first_run
+    from baselines.speed.footprint import MEMORY_FORMATIONS, START_FORMATIONS
+    from baselines.speed.peers import pythons_of
     from baselines.speed.speed import measure
+    from baselines.speed.trained import TRAINING
     from baselines.tables import speed_table
 
     counts = [] if formations == "none" else whole_numbers("formations", formations)
+    pythons = pythons_of(peer_python or ())
     if out is not None:
         writable_folder(out.parent)
     compile_before_first_run()
@@ -66,11 +90,17 @@ def speed(
             threads=whole_numbers("threads", threads),
             peers=peers,
             parts=parts,
+            peer_pythons=pythons,
+            memory=MEMORY_FORMATIONS if memory else None,
+            start=START_FORMATIONS if cold else None,
+            training=TRAINING if training else None,
         )
     text = json.dumps(result, indent=2)
     if out is not None:
         out.write_text(text + "\n", encoding="utf-8")
     notes.print(speed_table(result))
+    for line in result["left_out"].values():
+        notes.print(line, soft_wrap=True)
     typer.echo(text)
 
 

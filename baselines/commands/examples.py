@@ -44,6 +44,7 @@ EXAMPLES: dict[str, dict[str, str]] = {
     "speed": {
         "tlf speed": "ours alone and many at once, and the peers that are installed",
         "tlf speed --formations 1024 --steps 200": "one size, shorter",
+        "tlf speed --memory --cold --training": "memory, starts, and the time to a trained policy, too",
     },
     "bench": {
         "tlf bench --policies reference,residual --tasks infinity --disturbances slip,ice --seeds 0:10": "a "

@@ -1,4 +1,4 @@
-"""The environments that are timed: ours, alone and many at once, and the peers mpe2 and VMAS."""
+"""The environments that are timed: ours, alone and many at once, and the peers."""
 
 from __future__ import annotations
 
@@ -6,22 +6,16 @@ import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from importlib.util import find_spec
 from typing import Any
 
 import numpy as np
 
 from baselines.policies.reference import ReferencePolicy
 from baselines.speed.moments import STEPS_KEPT, Moments, VectorRun
+from baselines.speed.peers import MPE2, PEER_ROBOTS, PEERS, VECTOR, VMAS, Peer, is_missing
+from baselines.speed.worker import Worker
 from tlf_env.envs.parallel import parallel_env
 
-MPE2, VMAS, ALONE, VECTOR = (
-    "mpe2/simple_spread_v3",
-    "vmas/diff_drive",
-    "tlf_env/infinity-v0",
-    "tlf_env.FormationVectorEnv",
-)
-PEER_ROBOTS = 3  # of VMAS
 # Scenarios that cost less or more: few position fixes, and robots that slide.
 SPECIAL: dict[str, dict[str, Any]] = {
     f"{VECTOR}, fixes at 100 Hz": {"disturbance": {"position": {"period_s": 0.01}}},
@@ -29,11 +23,11 @@ SPECIAL: dict[str, dict[str, Any]] = {
 }
 SPECIAL_FORMATIONS = 1024
 VMAS_SHARE = 0.1
-PEER_CYCLES = 25  # simple_spread's own default episode
 FORMATION_STEPS = (
     25_000  # of all formations in one timing; at least MIN_STEPS and at most `steps` each
 )
 MIN_STEPS = 3
+STEPS_AT_ONCE = 100  # at most, of a peer that takes several in one go
 PAPERS_FILTER: dict[str, Any] = {"estimator": "ekf", "broadcast_smoothing_s": 0.0}
 
 
@@ -113,34 +107,16 @@ def special_environments(steps: int) -> list[TimedEnvironment]:
 
 def mpe2_environment(robots: int) -> TimedEnvironment | None:
     """mpe2's ``simple_spread_v3`` with continuous actions and as many agents; None without mpe2."""
-    if find_spec("mpe2") is None:
+    if is_missing(PEERS[MPE2]):
         return None
-    from mpe2 import simple_spread_v3
+    from baselines.speed.mpe2 import mpe2_drive
 
-    env = simple_spread_v3.parallel_env(N=robots, continuous_actions=True, max_cycles=PEER_CYCLES)
-    env.reset(seed=0)
-    generator = np.random.default_rng(0)
-    recorded = [
-        {agent: generator.random(5, dtype=np.float32) for agent in env.possible_agents}
-        for _ in range(PEER_CYCLES)
-    ]
-
-    def drive(count: int) -> float:
-        total = 0.0
-        for _ in range(max(1, count // PEER_CYCLES)):
-            env.reset(seed=0)
-            start = time.perf_counter()
-            for actions in recorded:
-                env.step(actions)
-            total += time.perf_counter() - start
-        return total * count / (max(1, count // PEER_CYCLES) * PEER_CYCLES)
-
-    return TimedEnvironment(MPE2, robots, drive)
+    return TimedEnvironment(MPE2, robots, mpe2_drive(robots))
 
 
 def vmas_environments(formations: Sequence[int], threads: Sequence[int]) -> list[TimedEnvironment]:
     """VMAS with its DiffDrive dynamics; empty without vmas."""
-    if find_spec("vmas") is None:
+    if is_missing(PEERS[VMAS]):
         return []
     from baselines.speed.vmas import vmas_drive
 
@@ -152,3 +128,25 @@ def vmas_environments(formations: Sequence[int], threads: Sequence[int]) -> list
         for used in threads
         if used == 1 or count > 1
     ]
+
+
+def served_environments(
+    peer: Peer, worker: Worker, robots: int, formations: Sequence[int], threads: int, steps: int
+) -> list[TimedEnvironment]:
+    """A peer in a process of its own, which compiles for each number of formations here.
+
+    Raises
+    ------
+    PeerError
+        if it cannot be made.
+    """
+    made = []
+    for count in formations if peer.many else (1,):
+        if threads > 1 and count == 1:
+            continue
+        one = TimedEnvironment(
+            peer.name, robots, partial(worker.drive, formations=count), count, threads
+        )
+        worker.make(count, min(STEPS_AT_ONCE, one.steps(steps)))
+        made.append(one)
+    return made

@@ -89,3 +89,8 @@ def vmas_drive(robots: int, formations: int, threads: int) -> Callable[[int], fl
             torch.set_num_threads(before)
 
     return drive
+
+
+def vmas_served(robots: int, formations: int, threads: int, at_once: int) -> Callable[[int], float]:
+    """:func:`vmas_drive` as :mod:`~baselines.speed.served` asks for it."""
+    return vmas_drive(robots, formations, threads)
