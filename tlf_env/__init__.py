@@ -9,7 +9,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from tlf_env.common.importing import when_imported
+import gymnasium
+import pettingzoo
 
 if TYPE_CHECKING:
     from tlf_env.engine.batch import BatchPlant
@@ -56,6 +57,8 @@ def __getattr__(name: str) -> Any:
     return getattr(importlib.import_module(_MODULES[name]), name)
 
 
+_PETTINGZOO_HAS_IDS = hasattr(pettingzoo, "register")  # from 1.27 on
+
 # Written out, as reading the folder of presets would slow down every import.
 TASKS = (
     "circle",
@@ -71,35 +74,18 @@ TASKS = (
     "stop_and_go",
     "warehouse",
 )
-
-
-def _register_with_gymnasium() -> None:
-    import gymnasium
-
-    for task in TASKS:
-        gymnasium.register(
-            f"tlf_env/{task.title().replace('_', '')}-v0",
-            "tlf_env.envs.single:FormationEnv",
-            vector_entry_point="tlf_env.envs.vector:FormationVectorEnv",
-            kwargs={"scenario": task},
-        )
-
-
-def _register_with_pettingzoo() -> None:
-    import pettingzoo
-
-    if not hasattr(pettingzoo, "register"):  # from 1.27 on
-        return
-    for task in TASKS:
-        for kind in ("parallel", "aec"):
+for _task in TASKS:
+    if _PETTINGZOO_HAS_IDS:
+        for _kind in ("parallel", "aec"):
             pettingzoo.register(
-                kind,
-                f"tlf_env/{task}-v0",
-                f"tlf_env.envs.parallel:{kind}_env",
-                kwargs={"scenario": task},
+                _kind,
+                f"tlf_env/{_task}-v0",
+                f"tlf_env.envs.parallel:{_kind}_env",
+                kwargs={"scenario": _task},
             )
-
-
-# A task can be asked for only once they are imported.
-when_imported("gymnasium", _register_with_gymnasium)
-when_imported("pettingzoo", _register_with_pettingzoo)
+    gymnasium.register(
+        f"tlf_env/{_task.title().replace('_', '')}-v0",
+        "tlf_env.envs.single:FormationEnv",
+        vector_entry_point="tlf_env.envs.vector:FormationVectorEnv",
+        kwargs={"scenario": _task},
+    )
