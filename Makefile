@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run compile test test-slow test-learning check check-audit check-docs check-install check-lowest check-clients check-pages check-paper browser check-live docs format board speed speed-docs constraints clean
+.PHONY: help run compile test test-slow test-learning check check-audit check-docs check-install check-lowest check-clients check-pages check-paper check-faults check-fuzz check-endurance check-mutants check-stress browser check-live docs format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -110,6 +110,31 @@ check-audit: $(VENV)/.stamp-test ## List the licences of all requirements, and l
 	"$$tmp/bin/pip-licenses" --python=$(BIN)/python --format=markdown --ignore-packages codespell \
 		--fail-on "$(REFUSED_LICENCES)"; \
 	"$$tmp/bin/pip-audit" --strict --no-deps --disable-pip -r constraints.txt
+
+# The campaign of docs/reliability.md. Each writes into results/campaign what it has tried; most go on where they stopped.
+CASES ?= 600
+check-fuzz: $(VENV)/.stamp-test ## Try files, actions, snapshots and arguments that are wrong (an hour)
+	$(BIN)/python tests/campaign/fuzz.py --cases $(CASES)
+
+SUBSTEPS ?= 1e8
+check-stress: $(VENV)/.stamp-test ## Audit work, momentum and friction in every substep of random robots (an hour)
+	$(BIN)/python tests/campaign/stress.py batch --substeps $(SUBSTEPS)
+	$(BIN)/python tests/campaign/stress.py presets --cases 66
+	$(BIN)/python tests/campaign/stress.py chipmunk --substeps 1e6
+	$(BIN)/python tests/campaign/stress.py contact --substeps 1e6
+	$(BIN)/python tests/campaign/stress.py agree --cases 100
+
+check-faults: $(VENV)/.stamp-train ## Kill and stop the long commands, and take their disk away (as root, an hour)
+	$(BIN)/python tests/campaign/kills.py --kills 50
+	$(BIN)/python tests/campaign/stops.py --learning
+	$(BIN)/python tests/campaign/disks.py
+	$(BIN)/python tests/campaign/compiling.py
+
+check-endurance: $(VENV)/.stamp-test ## Ten million steps, a thousand environments, wrong clocks (needs faketime)
+	for what in steps many starts clock; do $(BIN)/python tests/campaign/endurance.py $$what || exit 1; done
+
+check-mutants: $(VENV)/.stamp-test ## Change the laws at random, and count the changes that the tests notice (an hour)
+	$(BIN)/python tests/campaign/mutants.py
 
 # The live windows under real keys and a real mouse; their pictures stay in results/live.
 check-live: $(VENV)/.stamp-test ## Drive the live windows on a virtual display (needs Xvfb and xdotool)
