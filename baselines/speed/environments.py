@@ -16,10 +16,16 @@ from baselines.speed.peers import MPE2, PEER_ROBOTS, PEERS, VECTOR, VMAS, Peer, 
 from baselines.speed.worker import Worker
 from tlf_env.envs.parallel import parallel_env
 
-# Scenarios that cost less or more: few position fixes, and robots that slide.
+# What costs less or more: few position fixes, robots that slide, and numbers of single precision.
+FEW_FIXES = {"position": {"period_s": 0.01}}
 SPECIAL: dict[str, dict[str, Any]] = {
-    f"{VECTOR}, fixes at 100 Hz": {"disturbance": {"position": {"period_s": 0.01}}},
+    f"{VECTOR}, fixes at 100 Hz": {"disturbance": FEW_FIXES},
     f"{VECTOR}, combined-hard": {"disturbance": "combined-hard"},
+    f"{VECTOR}, single precision": {"precision": "single"},
+    f"{VECTOR}, single precision, fixes at 100 Hz": {
+        "precision": "single",
+        "disturbance": FEW_FIXES,
+    },
 }
 SPECIAL_FORMATIONS = 1024
 VMAS_SHARE = 0.1
