@@ -74,21 +74,23 @@ OTHER_PACKAGES = """
 COPIED = ("tlf_env", "baselines", "tests", "configs", "examples", "docs")
 EXAMPLES = 20  # of Hypothesis for each property that does not ask for another number
 LONGEST_TEST_S = {"python": 0.8, "compiled": 1.0}  # processor time
-LONGEST_FILE_S = {"python": 20.0, "compiled": 6.0}  # what is left of a file is not used
-MOST_TESTS_S = {"python": 6.0, "compiled": 8.0}  # of all tests for one mutant, by their times without a change
-SLOWER, MORE_S = 10.0, 15.0  # the limit of a run: so many times what it should take, and so much more
+STOP_S = {"python": 1.2, "compiled": 8.0}  # a first test may load drivers
+LONGEST_FILE_S = {"python": 20.0, "compiled": 15.0}  # what is left of a file is not used
+MOST_TESTS_S = {"python": 2.5, "compiled": 3.0}  # of all tests for one mutant, by their times without a change
+COLD_S = 30.0  # importing, and compiling the drivers of one file
+SLOWER, MORE_S = 3.0, 4.0  # the limit of a run: so many times what it should take, and so much more
 
 # Files with tests of the laws that need no whole episode, and files that use the rooms' plain Python.
 LAW_FILES = """
     friction openloop sliding linear rays laws tracking_laws textbook_laws sliding_mode disturbance_rejection
     limiter limited_actions spacing supervisor observer estimator slip_estimator gyro_estimator wheel_loop
-    scenario_page
+    scenario_page sensors
 """.split()
 PLAIN_FILES = """
-    table_1 linear openloop state shapes rays objects world world_input contact chipmunk parts memory snapshots
-    python_estimators policies files errors limiter supervisor
+    table_1 openloop state shapes objects world world_input contact chipmunk parts memory snapshots files
 """.split()
 FILES: dict[str, Sequence[str]] = {"python": LAW_FILES, "compiled": PLAIN_FILES}
+DEFAULTS = ("tests/test_scenario_page.py", "tests/test_table_1.py")  # compare defaults with the pages
 FRESH = ("kernel", "physics_numbers")  # of the plant, with the driver of physics_helpers.py
 FRESH_OF = {"tlf_env/physics/sliding.py": ("sliding",), "tlf_env/physics/openloop.py": ("openloop",)}
 EPISODES = {
@@ -202,14 +204,33 @@ class _Loop:
 
 def _load_drivers() -> None:
     """Compile the drivers, or load them, before any child needs them."""
+    import numpy as np
+
     import tlf_env
 
     for plant in ("pymunk", "kinematic", "chipmunk"):
         env = tlf_env.parallel_env("infinity", plant=plant)
         env.reset(seed=0)
-        env.step({agent: env.action_space(agent).sample() * 0 for agent in env.agents})
+        env.step({agent: np.zeros(2) for agent in env.agents})
     batch = tlf_env.BatchPlant("infinity", 2, threads=1)
     batch.reset(seed=0)
+    batch.step(np.zeros((2, 3, 2)))
+    env = tlf_env.parallel_env("infinity", estimator=_Still)  # the drivers for parts in Python
+    env.reset(seed=0)
+    env.step({agent: np.zeros(2) for agent in env.agents})
+
+
+class _Still:
+    """An estimator that thinks that the robot stands."""
+
+    def __init__(self, robot: Any, period_s: float) -> None:
+        pass
+
+    def reset(self, pose: Any) -> None:
+        self.pose = pose.copy()
+
+    def update(self, readings: Any) -> Any:
+        return self.pose
 
 
 def _functions() -> dict[tuple[str, str], list[Any]]:
@@ -257,7 +278,7 @@ def _imported(job: dict[str, Any], mode: str, copy: Path) -> dict[str, Any]:
     """Import everything anew, and run tests."""
     import pytest
 
-    _prepare(mode, copy, job["fresh"])
+    _prepare(mode, copy, job["fresh"], job["file"])
     plugin = _Plugin(mode, False, job["tests"])
     code = int(pytest.main([*QUIET, "-x", *job["files"]], plugins=[plugin]))
     if plugin.failed is None and code not in (0, 5):
@@ -311,7 +332,7 @@ def _forked(job: dict[str, Any], run: Callable[[], dict[str, Any]]) -> dict[str,
         return {**result, "children_s": used.ru_utime + used.ru_stime}
 
 
-def _prepare(mode: str, place: Path, fresh: bool = False) -> None:
+def _prepare(mode: str, place: Path, fresh: bool = False, changed_file: str = "") -> None:
     """Let the laws run without Numba; or use the checkout's cache of drivers, without writing into it."""
     import numpy as np
 
@@ -351,7 +372,22 @@ def _prepare(mode: str, place: Path, fresh: bool = False) -> None:
 
         compiled._Locator.__init__ = of_the_unchanged
         if place != ROOT:
+            _compile_anew(place / changed_file)
             _keep_nothing()
+
+
+def _compile_anew(file: Path) -> None:
+    """Take no driver of this file from the cache."""
+    from tlf_env.numerics import compiled
+
+    made, load = compiled._Cache.__init__, compiled._Cache._load
+
+    def init(self: Any, function: Any) -> None:
+        made(self, function)
+        self.stale = function.__code__.co_filename == str(file)
+
+    compiled._Cache.__init__ = init
+    compiled._Cache._load = lambda self, *key: None if self.stale else load(self, *key)
 
 
 def _keep_nothing() -> None:
@@ -422,7 +458,7 @@ class _Plugin:
             self.called = set()
             self.began = time.process_time()
             signal.signal(signal.SIGPROF, self._stop)
-            signal.setitimer(signal.ITIMER_PROF, 1.5 * LONGEST_TEST_S[self.mode])
+            signal.setitimer(signal.ITIMER_PROF, STOP_S[self.mode])
             sys.setprofile(self._note)
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
@@ -583,19 +619,21 @@ def test_map(mode: str, copy: Path, warm: Worker) -> dict[str, Any]:
 def chosen(tests: dict[str, Any], mutant: mutation.Mutant, mode: str) -> list[str]:
     """Tests for a mutant: first those that call its function, then the others of their files."""
 
-    def calls(test: dict[str, Any]) -> bool:
+    def calls(name: str, test: dict[str, Any]) -> bool:
+        if not mutant.inside and name.startswith(DEFAULTS):
+            return True
         for one in test["calls"]:
-            file, _, name = one.partition("::")
-            plain = name.replace(".<locals>", "")
+            file, _, called = one.partition("::")
             if file == mutant.file and (
-                not mutant.function
-                or plain == mutant.function
-                or plain.startswith(f"{mutant.function}.")
+                not mutant.inside
+                or called == mutant.function
+                or called.replace(".<locals>", "") == mutant.function
+                or called.startswith(f"{mutant.function}.")
             ):
                 return True
         return False
 
-    first = {name for name, test in tests.items() if calls(test)}
+    first = {name for name, test in tests.items() if calls(name, test)}
     files = {name.partition("::")[0] for name in first}
     others = {name for name in tests if name.partition("::")[0] in files} - first
     found, used = [], 0.0
@@ -649,9 +687,11 @@ class Judge:
     def runs(self, mutant: mutation.Mutant) -> Iterator[tuple[str, dict[str, Any]]]:
         """The ways to run tests, one after the other."""
         source = mutation.source_of(ROOT, mutant, COMPILING)
+        law = mutant.compiled and mutant.inside
+        has_drivers = "@driver\n" in source
         for mode in MODES:
             names = chosen(self.maps[mode], mutant, mode)
-            if names:
+            if names and (mode == "python" or has_drivers or not law):
                 yield mode, self.tests(mutant, source, mode, names)
         room = mutant.file.split("/")[1]
         stems = FRESH_OF.get(mutant.file, FRESH if room == "physics" else ())
@@ -662,6 +702,7 @@ class Judge:
                     files=[f"tests/test_{stem}.py" for stem in stems],
                     tests=[],
                     fresh=True,
+                    file=mutant.file,
                     limit_s=900 if self.episodes else 150,
                 )
 
@@ -673,14 +714,14 @@ class Judge:
         job = {"tests": names, "limit_s": SLOWER * usual + MORE_S}
         if self.control:
             return self.warm[mode].run(**job)
-        answer = self.warm[mode].run(
-            **job, source=source, file=mutant.file, function=mutant.function
-        )
-        if answer["outcome"] != "cold":
-            return answer
+        job |= {"file": mutant.file}
+        if mutant.inside and (mode == "python" or not mutant.compiled):
+            answer = self.warm[mode].run(**job, source=source, function=mutant.function)
+            if answer["outcome"] != "cold":
+                return answer
         with changed(self.copy, mutant.file, source):
             files = sorted({one.partition("::")[0] for one in names})
-            return self.cold[mode].run(**job, files=files)
+            return self.cold[mode].run(**job | {"limit_s": job["limit_s"] + COLD_S}, files=files)
 
 
 @contextlib.contextmanager

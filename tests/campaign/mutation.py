@@ -65,7 +65,8 @@ class Mutant(NamedTuple):
     node: int
     edit: int
     line: int
-    function: str  # qualified name; empty at the level of the module or of a class
+    function: str  # qualified name of the function, or of the class; empty at the level of the module
+    inside: bool  # of a function
     compiled: bool  # the function is a law or a driver, or the change is at the level of the module
     kind: str
     before: str
@@ -85,6 +86,7 @@ class Place(NamedTuple):
     index: int | None  # in a list of the parent
     node: ast.AST
     function: str
+    inside: bool
     compiled: bool
 
     def put(self, node: ast.AST) -> None:
@@ -100,23 +102,21 @@ def places(tree: ast.Module, compiling: frozenset[str]) -> list[Place]:
     """All nodes of a file in a fixed order, without those that are never changed."""
     found: list[Place] = []
 
-    def walk(node: ast.AST, function: str, compiled: bool) -> None:
+    def walk(node: ast.AST, name: str, inside: bool, compiled: bool) -> None:
         if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef | ast.ClassDef):
-            inside = f"{function}.{node.name}" if function else node.name
-            if not isinstance(node, ast.ClassDef):
-                names = {_name(one) for one in node.decorator_list}
-                compiled = bool(names & compiling)
-        else:
-            inside = function
+            name = f"{name}.{node.name}" if name else node.name
+            inside = not isinstance(node, ast.ClassDef)
+            if inside:
+                compiled = bool({_name(one) for one in node.decorator_list} & compiling)
         for field, value in ast.iter_fields(node):
             if field in ("annotation", "returns", "decorator_list", "bases", "exc", "cause", "type"):
                 continue
             if isinstance(value, ast.AST):
-                step(Place(node, field, None, value, inside, compiled))
+                step(Place(node, field, None, value, name, inside, compiled))
             elif isinstance(value, list):
                 for i, one in enumerate(value):
                     if isinstance(one, ast.AST):
-                        step(Place(node, field, i, one, inside, compiled))
+                        step(Place(node, field, i, one, name, inside, compiled))
 
     def step(place: Place) -> None:
         node = place.node
@@ -127,9 +127,9 @@ def places(tree: ast.Module, compiling: frozenset[str]) -> list[Place]:
         if isinstance(node, ast.Assign) and "__all__" in ast.unparse(node.targets[0]):
             return
         found.append(place)
-        walk(node, place.function, place.compiled)
+        walk(node, place.function, place.inside, place.compiled)
 
-    walk(tree, "", True)
+    walk(tree, "", False, True)
     return found
 
 
@@ -244,6 +244,7 @@ def mutants_of(root: Path, file: str, compiling: frozenset[str]) -> list[Mutant]
                     edit=edit,
                     line=getattr(place.node, "lineno", 0),
                     function=place.function,
+                    inside=place.inside,
                     compiled=place.compiled,
                     kind=kind,
                     before=_short(place.node),
