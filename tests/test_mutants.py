@@ -95,12 +95,23 @@ def test_a_sample_is_drawn_in_proportion_to_the_lines_and_by_its_seed(module):
 
 
 def test_the_tests_of_friction_notice_changes_of_its_law(tmp_path):
-    command = [sys.executable, "tests/campaign/mutants.py", "--only", "physics/friction.py", "--sample", "5"]
+    command = [
+        sys.executable,
+        "tests/campaign/mutants.py",
+        "--only",
+        "physics/friction.py",
+        "--sample",
+        "5",
+    ]
     out = tmp_path / "results.json"
     paths = ["--out", str(out), "--copy", str(tmp_path / "copy")]
     before = {one: one.read_bytes() for one in (ROOT / "tlf_env" / "physics").glob("*.py")}
     done = subprocess.run(
-        [*command, *paths, "--tests", "friction"], cwd=ROOT, capture_output=True, text=True, check=False
+        [*command, *paths, "--tests", "friction"],
+        cwd=ROOT,
+        capture_output=True,
+        text=True,
+        check=False,
     )
     assert done.returncode == 0, done.stderr
     results = json.loads(out.read_text(encoding="utf-8"))["mutants"]

@@ -1,32 +1,32 @@
-"""Mutation testing of the laws: do the tests notice small errors in ``tlf_env/physics`` and ``tlf_env/onboard``?
+"""Mutation testing of the laws: which small errors in tlf_env/physics and tlf_env/onboard do tests notice?
 
     python tests/campaign/mutants.py --sample 300 --seed 1
-    python tests/campaign/mutants.py --sample 300 --seed 1 --again       # the survivors, after a new test
+    python tests/campaign/mutants.py --sample 300 --seed 1 --again    # the survivors, after a new test
     python tests/campaign/mutants.py --only physics/friction --sample 40
 
-Each mutant is one change of the sources (``mutation.py``), drawn at random from every file in proportion to its
-lines. The checkout is never edited. A change inside a function is made in memory, in a child of a process that has
-imported everything and collected the tests; any other change in a temporary copy of the project, where all is
-imported anew. Then the tests run that call the changed function, and after them the others of their files, shortest
-first, until one fails: the mutant is *killed*. A run that takes far longer than it should is ended, and counts
-as killed, by the time limit.
+Each mutant is one change of the sources (``mutation.py``), drawn at random from every file in proportion
+to its lines. The checkout is never edited. A change inside a function is made in memory, in a child of a
+process that has imported everything and collected the tests; any other change in a temporary copy of the
+project, where all is imported anew. Then the tests run that call the changed function, and after them the
+others of their files, shortest first, until one fails: the mutant is *killed*. A run that takes far longer
+than it should is ended, and counts as killed, by the time limit.
 
 Each mutant goes through up to three ways to run tests:
 
-- ``python``: with Numba switched off, so that a change of a law needs no compiling. What Numba's own code does in
-  the laws (tables on the stack, bits of floats) is done in Python.
-- ``compiled``: with the drivers of the unchanged sources, from the cache. So whole episodes run, and a change of
+- ``python``: with Numba switched off, so that a change of a law needs no compiling. What Numba's own code
+  does in the laws (tables on the stack, bits of floats) is done in Python.
+- ``compiled``: with the drivers of the unchanged sources, from the cache. So episodes run, and a change of
   plain Python is judged by them.
-- ``fresh``, with ``--again``: a law of the plant that survived is compiled anew, with the small drivers of the tests
-  of the plant. With ``--again --episodes`` the survivors of both rooms are, with the drivers of the episodes, which
-  takes minutes each.
+- ``fresh``, with ``--again``: a law of the plant that survived is compiled anew, with the small drivers of
+  the tests of the plant. With ``--again --episodes`` the survivors of both rooms are, with the drivers of
+  the episodes, which takes minutes each.
 
-Which test calls which function is found out once. Tests that do not pass without a change, or take too long, are
-left out, and so are recorded bits (``test_golden.py``, ``test_digest.py``): any change of a law alters them, which
-says nothing about the other tests.
+Which test calls which function is found out once, and again for a file that has changed. Tests that do not
+pass without a change, or take too long, are left out, and so are recorded bits (``test_golden.py``,
+``test_digest.py``): any change of a law alters them, which says nothing about the other tests.
 
-Why not a library: mutmut makes no mutants of decorated functions, as all laws are; cosmic-ray starts a new process
-for each mutant, which takes longer here than the tests, and changes the files in their place.
+Why not a library: mutmut makes no mutants of decorated functions, as all laws are; cosmic-ray starts a new
+process for each mutant, which takes longer here than the tests, and changes the files in their place.
 """
 
 from __future__ import annotations
@@ -67,32 +67,84 @@ COMPILING = frozenset({"law", "block", "view", "allocating", "driver"})
 MODES = ("python", "compiled")
 ALIVE = ("survived", "no test")
 QUIET = ("-q", "-s", "-p", "no:cacheprovider", "--no-header", "-W", "ignore")
-OTHER_PACKAGES = """
-    gymnasium numba pettingzoo pydantic pymunk rich.progress scipy.integrate scipy.linalg scipy.optimize
-    scipy.spatial scipy.stats typer yaml
-""".split()
+OTHER_PACKAGES = (
+    "gymnasium",
+    "numba",
+    "pettingzoo",
+    "pydantic",
+    "pymunk",
+    "rich.progress",
+    "scipy.integrate",
+    "scipy.linalg",
+    "scipy.optimize",
+    "scipy.spatial",
+    "scipy.stats",
+    "typer",
+    "yaml",
+)
 COPIED = ("tlf_env", "baselines", "tests", "configs", "examples", "docs")
 EXAMPLES = 20  # of Hypothesis for each property that does not ask for another number
 LONGEST_TEST_S = {"python": 0.8, "compiled": 1.0}  # processor time
 STOP_S = {"python": 1.2, "compiled": 1.5}  # a first test may load drivers
 LONGEST_FILE_S = {"python": 20.0, "compiled": 15.0}  # what is left of a file is not used
-MOST_TESTS_S = {"python": 2.5, "compiled": 3.0}  # of all tests for one mutant, by their times without a change
+MOST_TESTS_S = {
+    "python": 2.5,
+    "compiled": 3.0,
+}  # of all tests for one mutant, by their times without a change
 COLD_S = 30.0  # importing, and compiling the drivers of one file
 SLOWER, MORE_S = 3.0, 4.0  # the limit of a run: so many times what it should take, and so much more
 
 # Files with tests of the laws that need no whole episode, and files that use the rooms' plain Python.
-LAW_FILES = """
-    friction openloop sliding linear rays laws tracking_laws textbook_laws sliding_mode disturbance_rejection
-    limiter limited_actions spacing supervisor observer estimator slip_estimator gyro_estimator wheel_loop
-    scenario_page sensors kernel world
-""".split()
-PLAIN_FILES = """
-    table_1 openloop state shapes objects world world_input contact chipmunk parts memory snapshots files
-""".split()
+LAW_FILES = (
+    "friction",
+    "openloop",
+    "sliding",
+    "linear",
+    "rays",
+    "laws",
+    "tracking_laws",
+    "textbook_laws",
+    "sliding_mode",
+    "disturbance_rejection",
+    "limiter",
+    "limited_actions",
+    "spacing",
+    "supervisor",
+    "observer",
+    "estimator",
+    "slip_estimator",
+    "gyro_estimator",
+    "wheel_loop",
+    "scenario_page",
+    "sensors",
+    "kernel",
+    "world",
+)
+PLAIN_FILES = (
+    "table_1",
+    "openloop",
+    "state",
+    "shapes",
+    "objects",
+    "world",
+    "world_input",
+    "contact",
+    "chipmunk",
+    "parts",
+    "memory",
+    "snapshots",
+    "files",
+)
 FILES: dict[str, Sequence[str]] = {"python": LAW_FILES, "compiled": PLAIN_FILES}
-DEFAULTS = ("tests/test_scenario_page.py", "tests/test_table_1.py")  # compare defaults with the pages
+DEFAULTS = (
+    "tests/test_scenario_page.py",
+    "tests/test_table_1.py",
+)  # compare defaults with the pages
 FRESH = ("kernel", "physics_numbers")  # of the plant, with the driver of physics_helpers.py
-FRESH_OF = {"tlf_env/physics/sliding.py": ("sliding",), "tlf_env/physics/openloop.py": ("openloop",)}
+FRESH_OF = {
+    "tlf_env/physics/sliding.py": ("sliding",),
+    "tlf_env/physics/openloop.py": ("openloop",),
+}
 EPISODES = {
     "physics": ("sliding", "tiles", "disturbed_plant", "floor_and_motors", "contact", "world"),
     "onboard": (
@@ -166,7 +218,9 @@ class _Loop:
 
     def pytest_collectreport(self, report: Any) -> None:
         if report.failed:
-            self.out.write(json.dumps({"outcome": "broken", "error": str(report.longrepr), "children_s": 0}))
+            self.out.write(
+                json.dumps({"outcome": "broken", "error": str(report.longrepr), "children_s": 0})
+            )
             os._exit(1)
 
     def pytest_runtestloop(self, session: Any) -> bool:
@@ -423,7 +477,12 @@ class _Plugin:
             return {"outcome": "map", "tests": self.tests}
         if self.failed is None:
             return {"outcome": "survived", "test": "", "error": "", "ran": self.ran}
-        return {"outcome": "killed", "test": self.failed[0], "error": self.failed[1], "ran": self.ran}
+        return {
+            "outcome": "killed",
+            "test": self.failed[0],
+            "error": self.failed[1],
+            "ran": self.ran,
+        }
 
     def pytest_collection_modifyitems(self, items: list[Any]) -> None:
         if self.order:
@@ -529,7 +588,9 @@ class Worker:
         self.process.stdin.write(json.dumps({"map": False, "fresh": False, **job}) + "\n")
         self.process.stdin.flush()
         line = self.process.stdout.readline()
-        answer: dict[str, Any] = json.loads(line) if line else {"outcome": "broken", "error": "it has ended"}
+        answer: dict[str, Any] = (
+            json.loads(line) if line else {"outcome": "broken", "error": "it has ended"}
+        )
         if answer["outcome"] == "broken":
             raise SystemExit(f"the process that runs tests ({self.mode}) failed: {answer['error']}")
         now = answer.pop("children_s")
@@ -550,7 +611,9 @@ class Worker:
 def sources_digest() -> str:
     """What the cache of drivers of the checkout is named by."""
     code = "from tlf_env.numerics.compiled import sources_digest as d; print(d())"
-    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
+    done = subprocess.run(
+        [sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True
+    )
     return done.stdout.strip()
 
 
@@ -592,18 +655,22 @@ def digest_of(copy: Path, *names: str) -> str:
 
 
 def test_map(mode: str, copy: Path, warm: Worker) -> dict[str, Any]:
-    """Of each test that passes in time: the functions that it calls and its processor time; kept in the copy."""
+    """Of each test that passes in time: the functions that it calls, and its processor time."""
     files = [f"tests/test_{stem}.py" for stem in FILES[mode]]
     missing = [file for file in files if not (ROOT / file).exists()]
     if missing:
-        raise SystemExit(f"{missing[0]} is missing: mend the lists of files in {Path(__file__).name}")
+        raise SystemExit(
+            f"{missing[0]} is missing: mend the lists of files in {Path(__file__).name}"
+        )
     path = copy / f".map-{mode}.json"
     kept = json.loads(path.read_text()) if path.exists() else {}
     shared = digest_of(copy, "tlf_env", "tests/helpers.py", "tests/physics_helpers.py")
     digests = {file: f"{shared} {digest_of(copy, file)}" for file in files}
     stale = [file for file in files if kept.get(file, {}).get("digest") != digests[file]]
     for file in tqdm(stale, desc=f"tests, {mode}") if stale else ():
-        answer = warm.run(map=True, limit_s=900, files=[file], out=str(copy / f".map-{mode}.partial"))
+        answer = warm.run(
+            map=True, limit_s=900, files=[file], out=str(copy / f".map-{mode}.partial")
+        )
         if answer["outcome"] != "map":
             raise SystemExit(f"{file} ({mode}) did not run to its end: {answer}")
         kept[file] = {"digest": digests[file], "tests": answer["tests"]}
@@ -649,7 +716,9 @@ def chosen(tests: dict[str, Any], mutant: mutation.Mutant, mode: str) -> list[st
 class Judge:
     """What runs the tests of a mutant until one fails."""
 
-    def __init__(self, copy: Path, drivers: Path, again: bool, episodes: bool, control: bool) -> None:
+    def __init__(
+        self, copy: Path, drivers: Path, again: bool, episodes: bool, control: bool
+    ) -> None:
         self.copy, self.again, self.episodes, self.control = copy, again, episodes, control
         self.warm = {mode: Worker(mode, True, copy, drivers) for mode in MODES}
         self.cold = {mode: Worker(mode, False, copy, drivers) for mode in MODES}
@@ -698,12 +767,15 @@ class Judge:
         stems += EPISODES[room] if self.episodes else ()
         if mutant.compiled and stems and FILES["compiled"] and self.again and not self.control:
             with changed(self.copy, mutant.file, source):
-                yield "fresh", self.cold["compiled"].run(
-                    files=[f"tests/test_{stem}.py" for stem in stems],
-                    tests=[],
-                    fresh=True,
-                    file=mutant.file,
-                    limit_s=900 if self.episodes else 150,
+                yield (
+                    "fresh",
+                    self.cold["compiled"].run(
+                        files=[f"tests/test_{stem}.py" for stem in stems],
+                        tests=[],
+                        fresh=True,
+                        file=mutant.file,
+                        limit_s=900 if self.episodes else 150,
+                    ),
                 )
 
     def tests(
@@ -760,7 +832,9 @@ def report(results: list[dict[str, Any]]) -> str:
             f"{len(alive)} survived, {same} of them equivalent; killed of those that are not: {share}"
         )
     seconds = sum(one["seconds"] for one in results)
-    lines.append(f"processor time: {seconds / 60:.0f} min, {seconds / max(len(results), 1):.1f} s a mutant")
+    lines.append(
+        f"processor time: {seconds / 60:.0f} min, {seconds / max(len(results), 1):.1f} s a mutant"
+    )
     for one in results:
         if one["outcome"] in ALIVE:
             why = f"  [{one['equivalent']}]" if "equivalent" in one else ""
@@ -772,19 +846,34 @@ def report(results: list[dict[str, Any]]) -> str:
 
 def main() -> None:
     """Draw mutants, judge each, and write a line for each."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawTextHelpFormatter)
-    parser.add_argument("--sample", type=int, default=300, metavar="COUNT", help="number of mutants")
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawTextHelpFormatter
+    )
+    parser.add_argument(
+        "--sample", type=int, default=300, metavar="COUNT", help="number of mutants"
+    )
     parser.add_argument("--seed", type=int, default=1, help="of the draw")
     parser.add_argument("--only", metavar="MODULE", default="", help="for example physics/friction")
-    parser.add_argument("--key", metavar="KEY", default="", help="one mutant, by its key in the results")
-    parser.add_argument("--again", action="store_true", help="judge the survivors of a finished sample again")
-    parser.add_argument("--episodes", action="store_true", help="with --again: compile survivors in full")
-    parser.add_argument("--control", action="store_true", help="run the same tests without any change")
+    parser.add_argument(
+        "--key", metavar="KEY", default="", help="one mutant, by its key in the results"
+    )
+    parser.add_argument(
+        "--again", action="store_true", help="judge the survivors of a finished sample again"
+    )
+    parser.add_argument(
+        "--episodes", action="store_true", help="with --again: compile survivors in full"
+    )
+    parser.add_argument(
+        "--control", action="store_true", help="run the same tests without any change"
+    )
     parser.add_argument("--report", action="store_true", help="show the results that there are")
     parser.add_argument("--out", type=Path, help="default: results/campaign/mutants-SEED.json")
     parser.add_argument("--copy", type=Path, default=Path(tempfile.gettempdir()) / "tlf-mutants")
     parser.add_argument(
-        "--tests", nargs="+", metavar="STEM", help="only these files, for example friction, without Numba"
+        "--tests",
+        nargs="+",
+        metavar="STEM",
+        help="only these files, for example friction, without Numba",
     )
     parser.add_argument(
         "--drivers",
@@ -797,17 +886,23 @@ def main() -> None:
     parser.add_argument("--warm", action="store_true", help=argparse.SUPPRESS)
     options = parser.parse_args()
     if options.tests:
-        FILES.update({mode: () for mode in MODES} | {options.worker or "python": options.tests})
+        FILES.update(dict.fromkeys(MODES, ()) | {options.worker or "python": options.tests})
     if options.worker:
         worker(options.worker, options.warm, options.copy)
         return
 
-    sources = [f"tlf_env/{room}/{one.name}" for room in ROOMS for one in sorted((ROOT / "tlf_env" / room).glob("*.py"))]
+    sources = [
+        f"tlf_env/{room}/{one.name}"
+        for room in ROOMS
+        for one in sorted((ROOT / "tlf_env" / room).glob("*.py"))
+    ]
     sources = [one for one in sources if options.only in one]
     pools = {one: mutation.mutants_of(ROOT, one, COMPILING) for one in sources}
     pools = {file: mutants for file, mutants in pools.items() if mutants}
     if not pools:
-        raise SystemExit(f"--only {options.only}: no such module in tlf_env/physics and tlf_env/onboard")
+        raise SystemExit(
+            f"--only {options.only}: no such module in tlf_env/physics and tlf_env/onboard"
+        )
     lines = {file: len((ROOT / file).read_text().splitlines()) for file in pools}
     drawn = mutation.sample(pools, lines, options.sample, options.seed)
     if options.key:

@@ -65,7 +65,9 @@ class Mutant(NamedTuple):
     node: int
     edit: int
     line: int
-    function: str  # qualified name of the function, or of the class; empty at the level of the module
+    function: (
+        str  # qualified name of the function, or of the class; empty at the level of the module
+    )
     inside: bool  # of a function
     compiled: bool  # the function is a law or a driver, or the change is at the level of the module
     kind: str
@@ -109,7 +111,15 @@ def places(tree: ast.Module, compiling: frozenset[str]) -> list[Place]:
             if inside:
                 compiled = bool({_name(one) for one in node.decorator_list} & compiling)
         for field, value in ast.iter_fields(node):
-            if field in ("annotation", "returns", "decorator_list", "bases", "exc", "cause", "type"):
+            if field in (
+                "annotation",
+                "returns",
+                "decorator_list",
+                "bases",
+                "exc",
+                "cause",
+                "type",
+            ):
                 continue
             if isinstance(value, ast.AST):
                 step(Place(node, field, None, value, name, inside, compiled))
@@ -185,7 +195,10 @@ def _edits(place: Place) -> Iterator[Edit]:
             yield "statement", ast.Pass
         case ast.Compare(ops=[op]):
             for one in COMPARED[type(op)]:
-                yield "comparison", lambda one=one: ast.Compare(node.left, [one()], node.comparators)
+                yield (
+                    "comparison",
+                    lambda one=one: ast.Compare(node.left, [one()], node.comparators),
+                )
         case ast.BoolOp():
             junction = ast.Or if isinstance(node.op, ast.And) else ast.And
             yield "and/or", lambda: ast.BoolOp(junction(), node.values)
