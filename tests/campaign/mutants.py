@@ -84,15 +84,20 @@ OTHER_PACKAGES = (
 )
 COPIED = ("tlf_env", "baselines", "tests", "configs", "examples", "docs")
 EXAMPLES = 20  # of Hypothesis for each property that does not ask for another number
-LONGEST_TEST_S = {"python": 0.8, "compiled": 1.0}  # processor time
-STOP_S = {"python": 1.2, "compiled": 1.5}  # a first test may load drivers
-LONGEST_FILE_S = {"python": 20.0, "compiled": 15.0}  # what is left of a file is not used
+DEFAULTS = ("tests/test_scenario_page.py", "tests/test_table_1.py")  # compare defaults with pages
+# Limits in s of processor time, all scaled by --patience.
+LONGEST_TEST_S = {"python": 2.5, "compiled": 3.0}  # a longer test is not used
+STOP_S = {"python": 4.0, "compiled": 10.0}  # a longer test is ended; a first one may load drivers
+LONGEST_FILE_S = {"python": 60.0, "compiled": 60.0}  # what is left of a file is not used
 MOST_TESTS_S = {
-    "python": 2.5,
-    "compiled": 3.0,
-}  # of all tests for one mutant, by their times without a change
+    "python": 8.0,
+    "compiled": 10.0,
+}  # of a mutant's tests, by their times without a change
 COLD_S = 30.0  # importing, and compiling the drivers of one file
-SLOWER, MORE_S = 3.0, 4.0  # the limit of a run: so many times what it should take, and so much more
+SLOWER, MORE_S = (
+    3.0,
+    12.0,
+)  # the limit of a run: so many times what it should take, and so much more
 
 # Files with tests of the laws that need no whole episode, and files that use the rooms' plain Python.
 LAW_FILES = (
@@ -136,10 +141,6 @@ PLAIN_FILES = (
     "files",
 )
 FILES: dict[str, Sequence[str]] = {"python": LAW_FILES, "compiled": PLAIN_FILES}
-DEFAULTS = (
-    "tests/test_scenario_page.py",
-    "tests/test_table_1.py",
-)  # compare defaults with the pages
 FRESH = ("kernel", "physics_numbers")  # of the plant, with the driver of physics_helpers.py
 FRESH_OF = {
     "tlf_env/physics/sliding.py": ("sliding",),
@@ -243,7 +244,7 @@ class _Loop:
             chosen = [items[one] for one in job["tests"]]
         if not chosen:
             return {"outcome": "map", "tests": {}}
-        plugin = _Plugin(self.mode, job["map"])
+        plugin = _Plugin(self.mode, job["map"], job.get("patience", 1.0))
         chosen[0].config.pluginmanager.register(plugin)
         if "source" in job and not _exchanged(job, functions):
             return {"outcome": "cold"}
@@ -333,7 +334,7 @@ def _imported(job: dict[str, Any], mode: str, copy: Path) -> dict[str, Any]:
     import pytest
 
     _prepare(mode, copy, job["fresh"], job["file"])
-    plugin = _Plugin(mode, False, job["tests"])
+    plugin = _Plugin(mode, order=job["tests"])
     code = int(pytest.main([*QUIET, "-x", *job["files"]], plugins=[plugin]))
     if plugin.failed is None and code not in (0, 5):
         plugin.failed = "(import)", f"pytest ended with {code}"
@@ -458,10 +459,13 @@ class _TooLong(BaseException):
 class _Plugin:
     """Orders the tests of one run, notes the first that fails, and, for a map, what each calls."""
 
-    def __init__(self, mode: str, mapping: bool, order: Sequence[str] = ()) -> None:
+    def __init__(
+        self, mode: str, mapping: bool = False, patience: float = 1.0, order: Sequence[str] = ()
+    ) -> None:
         self.order = {test: i for i, test in enumerate(order)}
         self.map = mapping
         self.mode = mode
+        self.patience = patience
         self.failed: tuple[str, str] | None = None
         self.ran = 0
         self.tests: dict[str, Any] = {}
@@ -496,7 +500,8 @@ class _Plugin:
             self.failed = f"(import of {report.nodeid})", str(report.longrepr)[-1500:]
 
     def pytest_runtest_setup(self, item: Any) -> None:
-        if self.map and self.used[item.nodeid.partition("::")[0]] > LONGEST_FILE_S[self.mode]:
+        used = self.used[item.nodeid.partition("::")[0]]
+        if self.map and used > self.patience * LONGEST_FILE_S[self.mode]:
             import pytest
 
             pytest.skip("the file takes too long")
@@ -517,7 +522,7 @@ class _Plugin:
             self.called = set()
             self.began = time.process_time()
             signal.signal(signal.SIGPROF, self._stop)
-            signal.setitimer(signal.ITIMER_PROF, STOP_S[self.mode])
+            signal.setitimer(signal.ITIMER_PROF, self.patience * STOP_S[self.mode])
             sys.setprofile(self._note)
 
     def pytest_runtest_logfinish(self, nodeid: str) -> None:
@@ -654,7 +659,7 @@ def digest_of(copy: Path, *names: str) -> str:
     return found.hexdigest()[:16]
 
 
-def test_map(mode: str, copy: Path, warm: Worker) -> dict[str, Any]:
+def test_map(mode: str, copy: Path, warm: Worker, patience: float) -> dict[str, Any]:
     """Of each test that passes in time: the functions that it calls, and its processor time."""
     files = [f"tests/test_{stem}.py" for stem in FILES[mode]]
     missing = [file for file in files if not (ROOT / file).exists()]
@@ -662,14 +667,18 @@ def test_map(mode: str, copy: Path, warm: Worker) -> dict[str, Any]:
         raise SystemExit(
             f"{missing[0]} is missing: mend the lists of files in {Path(__file__).name}"
         )
-    path = copy / f".map-{mode}.json"
+    path = copy / f".map-{mode}-{patience:g}.json"
     kept = json.loads(path.read_text()) if path.exists() else {}
     shared = digest_of(copy, "tlf_env", "tests/helpers.py", "tests/physics_helpers.py")
     digests = {file: f"{shared} {digest_of(copy, file)}" for file in files}
     stale = [file for file in files if kept.get(file, {}).get("digest") != digests[file]]
     for file in tqdm(stale, desc=f"tests, {mode}") if stale else ():
         answer = warm.run(
-            map=True, limit_s=900, files=[file], out=str(copy / f".map-{mode}.partial")
+            map=True,
+            limit_s=900,
+            patience=patience,
+            files=[file],
+            out=str(copy / f".map-{mode}.partial"),
         )
         if answer["outcome"] != "map":
             raise SystemExit(f"{file} ({mode}) did not run to its end: {answer}")
@@ -679,11 +688,11 @@ def test_map(mode: str, copy: Path, warm: Worker) -> dict[str, Any]:
         name: test
         for file in files
         for name, test in kept[file]["tests"].items()
-        if test["passed"] and test["seconds"] <= LONGEST_TEST_S[mode]
+        if test["passed"] and test["seconds"] <= patience * LONGEST_TEST_S[mode]
     }
 
 
-def chosen(tests: dict[str, Any], mutant: mutation.Mutant, mode: str) -> list[str]:
+def chosen(tests: dict[str, Any], mutant: mutation.Mutant, most_s: float) -> list[str]:
     """Tests for a mutant: first those that call its function, then the others of their files."""
 
     def calls(name: str, test: dict[str, Any]) -> bool:
@@ -707,7 +716,7 @@ def chosen(tests: dict[str, Any], mutant: mutation.Mutant, mode: str) -> list[st
     for group in (first, others):
         for name in sorted(group, key=lambda one: (tests[one]["seconds"], one)):
             used += tests[name]["seconds"]
-            if used > MOST_TESTS_S[mode]:
+            if used > most_s:
                 return found
             found.append(name)
     return found
@@ -716,13 +725,15 @@ def chosen(tests: dict[str, Any], mutant: mutation.Mutant, mode: str) -> list[st
 class Judge:
     """What runs the tests of a mutant until one fails."""
 
-    def __init__(
-        self, copy: Path, drivers: Path, again: bool, episodes: bool, control: bool
-    ) -> None:
-        self.copy, self.again, self.episodes, self.control = copy, again, episodes, control
-        self.warm = {mode: Worker(mode, True, copy, drivers) for mode in MODES}
-        self.cold = {mode: Worker(mode, False, copy, drivers) for mode in MODES}
-        self.maps = {mode: test_map(mode, copy, self.warm[mode]) for mode in MODES}
+    def __init__(self, options: argparse.Namespace) -> None:
+        self.copy, self.patience, self.again = options.copy, options.patience, options.again
+        self.episodes, self.control = options.episodes, options.control
+        drivers = options.drivers.resolve()
+        self.warm = {mode: Worker(mode, True, self.copy, drivers) for mode in MODES}
+        self.cold = {mode: Worker(mode, False, self.copy, drivers) for mode in MODES}
+        self.maps = {
+            mode: test_map(mode, self.copy, self.warm[mode], self.patience) for mode in MODES
+        }
 
     def close(self) -> None:
         """End all processes."""
@@ -759,7 +770,7 @@ class Judge:
         law = mutant.compiled and mutant.inside
         has_drivers = "@driver\n" in source
         for mode in MODES:
-            names = chosen(self.maps[mode], mutant, mode)
+            names = chosen(self.maps[mode], mutant, self.patience * MOST_TESTS_S[mode])
             if names and (mode == "python" or has_drivers or not law):
                 yield mode, self.tests(mutant, source, mode, names)
         room = mutant.file.split("/")[1]
@@ -783,7 +794,7 @@ class Judge:
     ) -> dict[str, Any]:
         """Run tests with a change in memory, if that can be done, or else in the copy."""
         usual = sum(self.maps[mode][one]["seconds"] for one in names)
-        job = {"tests": names, "limit_s": SLOWER * usual + MORE_S}
+        job = {"tests": names, "limit_s": SLOWER * usual + self.patience * MORE_S}
         if self.control:
             return self.warm[mode].run(**job)
         job |= {"file": mutant.file}
@@ -876,6 +887,9 @@ def main() -> None:
         help="only these files, for example friction, without Numba",
     )
     parser.add_argument(
+        "--patience", type=float, default=1.0, help="factor on the times that tests may take"
+    )
+    parser.add_argument(
         "--drivers",
         type=Path,
         default=ROOT,
@@ -918,8 +932,7 @@ def main() -> None:
         return
 
     make_copy(options.copy)
-    drivers = options.drivers.resolve()
-    judge = Judge(options.copy, drivers, options.again, options.episodes, options.control)
+    judge = Judge(options)
     head = {"seed": options.seed, "sample": options.sample, "drawn": len(drawn)}
 
     def wanted(mutant: mutation.Mutant) -> bool:
