@@ -290,6 +290,28 @@ def test_error_rates_on_the_kinematic_plant_are_eq_17():
         np.testing.assert_allclose(measured, expected, rtol=1e-6, atol=1e-3)
 
 
+def test_the_castor_of_the_kinematic_plant_rolls_without_slip():
+    """Its contact moves only along its wheel, wherever the robot heads and however the fork stands."""
+    rng = np.random.default_rng(6)
+    robot, dt = RobotParameters(), 1e-6
+
+    def contact(motion: Motion) -> np.ndarray:
+        x, y = axle_midpoint(motion, BODY.d)
+        pivot = robot.castor_pivot_mm * np.array([math.sin(motion.theta), -math.cos(motion.theta)])
+        trail = robot.castor_trail_mm * np.array([math.sin(motion.psi), -math.cos(motion.psi)])
+        return np.array([x, y]) + pivot + trail
+
+    for _ in range(50):
+        before = at_pose(*rng.uniform(-5, 5, 2), rng.uniform(-4, 4))
+        before = before._replace(psi=rng.uniform(-4, 4))
+        wheels = rng.uniform(-8, 8, 2)
+        after = follow_wheels(BODY, before, *wheels, 0.0, 0.0, dt)
+        across = np.array([math.cos(before.psi), math.sin(before.psi)])
+        velocity = (contact(after) - contact(before)) / dt
+        assert abs(velocity @ across) < 0.02  # of hundreds of mm/s
+        assert after.psi - before.psi == pytest.approx(dt * after.s, rel=1e-6)
+
+
 @untimed
 @given(st.floats(-1, 1), st.floats(-1, 1))
 def test_twist_command_inverts_eq_1(forward, turn):
