@@ -8,8 +8,8 @@ Each mutant is one change of the sources (``mutation.py``), drawn at random from
 to its lines. The checkout is never edited. A change inside a function is made in memory, in a child of a
 process that has imported everything and collected the tests; any other change in a temporary copy of the
 project, where all is imported anew. Then the tests run that call the changed function, and after them the
-others of their files, shortest first, until one fails: the mutant is *killed*. A run that takes far longer
-than it should is ended, and counts as killed, by the time limit.
+others of their files, the shortest of every file first, until one fails: the mutant is *killed*. A run that
+takes far longer than it should is ended, and counts as killed, by the time limit.
 
 Each mutant goes through up to three ways to run tests:
 
@@ -714,12 +714,23 @@ def chosen(tests: dict[str, Any], mutant: mutation.Mutant, most_s: float) -> lis
     others = {name for name in tests if name.partition("::")[0] in files} - first
     found, used = [], 0.0
     for group in (first, others):
-        for name in sorted(group, key=lambda one: (tests[one]["seconds"], one)):
+        for name in _in_turn(group, tests):
             used += tests[name]["seconds"]
             if used > most_s:
                 return found
             found.append(name)
     return found
+
+
+def _in_turn(names: set[str], tests: dict[str, Any]) -> list[str]:
+    """The shortest test of every file, then the second of every file, and so on."""
+    seen: Counter[str] = Counter()
+    ranked = []
+    for name in sorted(names, key=lambda one: (tests[one]["seconds"], one)):
+        file = name.partition("::")[0]
+        ranked.append((seen[file], tests[name]["seconds"], name))
+        seen[file] += 1
+    return [name for *_, name in sorted(ranked)]
 
 
 class Judge:
