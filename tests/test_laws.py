@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import tlf_env
-from tlf_env.onboard.calibration import Belief
+from tlf_env.onboard.calibration import Belief, believed_odometry, believed_wheel_speeds
 from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.tracking import (
     body_errors,
@@ -317,6 +317,19 @@ def test_the_castor_of_the_kinematic_plant_rolls_without_slip():
 def test_twist_command_inverts_eq_1(forward, turn):
     wheels = wheel_command(forward, turn, TWIST, BODY, BELIEF)
     np.testing.assert_allclose(EQ_1 @ wheels, (1000 * forward, 8 * turn), rtol=1e-12, atol=1e-12)
+
+
+@untimed
+@given(st.floats(0.9, 1.1), st.floats(0.9, 1.1), st.floats(0.9, 1.1), st.floats(-1, 1))
+def test_a_computer_finds_the_twist_that_it_asked_for_whatever_it_believes(left, right, axle, turn):
+    """Its odometry is that of wheels with the believed radii on the believed axle, eq. (1)."""
+    belief = Belief(radius_l=left, radius_r=right, h=axle * L_MM / 2)
+    wheels = believed_wheel_speeds(300.0, turn, BODY, belief)
+    radii = R_MM * np.array([left, right])
+    rows = np.array([[0.5, 0.5], [-1 / (axle * L_MM), 1 / (axle * L_MM)]]) * radii
+    np.testing.assert_allclose(rows @ wheels, (300.0, turn), rtol=1e-12, atol=1e-12)
+    found = believed_odometry(*wheels, BODY, belief)
+    np.testing.assert_allclose(found, (300.0, turn), rtol=1e-12, atol=1e-12)
 
 
 def test_wheel_speed_command_is_in_units_of_25_rad_s():
