@@ -222,6 +222,23 @@ def test_the_space_leaves_robots_that_do_not_touch_alone():
         assert np.array_equal(motions, kernel)
 
 
+def test_the_space_that_a_user_reads_has_the_robots_where_they_are():
+    plant = PymunkPlant([ROBOT] * 2)
+    motions = np.random.default_rng(0).normal(size=(len(Motion._fields), 2, 1))
+    motions[X] = [[-500.0], [700.0]]
+    space = plant.space(motions, 0)
+    assert {*plant.bodies} <= {*space.bodies}
+    for i, body in enumerate(plant.bodies):
+        seen = (*body.position, body.angle, *body.velocity, body.angular_velocity)
+        assert seen == tuple(motions[[*POSE, *TWIST], i, 0])
+        (outline,) = body.shapes
+        info = space.point_query_nearest(
+            tuple(body.position), ROBOT.outline_radius_mm, pymunk.ShapeFilter()
+        )
+        assert info is not None
+        assert info.shape is outline  # the index knows the place, too
+
+
 def test_a_collision_far_away_changes_nothing_here():
     bystander = rolling(forward=200.0, yaw=0.4)._replace(x=50_000.0)
     made = meet([*head_on(20.0), bystander], 0.3)

@@ -150,6 +150,21 @@ def test_a_wrong_scale_of_the_gyro_is_found_where_the_robot_turns_both_ways():
     assert estimate.theta == pytest.approx(theta, abs=1e-3)
 
 
+@pytest.mark.parametrize("noise_mm", [0.3, 1.0])
+def test_the_variance_of_the_fixes_is_found_from_their_scatter(noise_mm):
+    """Where the robot stands, whatever the variance at the start; errors that stay do not count."""
+    rng = np.random.default_rng(5)
+    fixes = rng.normal((40.0, -20.0), noise_mm, size=(4000, 2))
+    ekf = gyro_ekf_constants(GyroEkfParameters(outlier_threshold=None), BODY, DT_S)
+    estimate, found = START._replace(x=40.0, y=-20.0), REST
+    levels = []
+    for x, y in fixes.tolist():
+        estimate, found = predict_with_gyro(estimate, found, ekf, 0.0, 0.0, 0.0, DT_S)
+        estimate, found, *_ = correct_with_gyro(estimate, found, ekf, x, y, 1.0, 0.0, 0.0, DT_S)
+        levels.append(ekf.variance + found.variance)
+    assert np.mean(levels[2000:]) == pytest.approx(noise_mm**2, rel=0.15)
+
+
 def test_an_outlier_moves_the_pose_less_the_farther_it_lies():
     """The influence of a fix grows up to the threshold and decreases beyond."""
     moved = {}

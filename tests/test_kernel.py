@@ -22,6 +22,9 @@ from physics_helpers import (
     wheel_slip,
 )
 
+from tlf_env.numerics.compiled import driver
+from tlf_env.numerics.rows import row_writer
+from tlf_env.physics.kernel import substep_frame
 from tlf_env.physics.parameters import (
     Body,
     FrictionCurve,
@@ -30,11 +33,22 @@ from tlf_env.physics.parameters import (
     RobotParameters,
     body,
 )
-from tlf_env.physics.state import Contact, Floor, Motion, conveyor
+from tlf_env.physics.state import (
+    Contact,
+    Floor,
+    Motion,
+    Push,
+    Rates,
+    conveyor,
+    read_body,
+    read_motion,
+)
+from tlf_env.physics.sweeps import begin_sweeps, sweep
 
 SEEDS = range(24)
 SECONDS = 2.0
 WEIGHT_mN = ROBOT.mass_kg * ROBOT.gravity_mm_s2
+write_rates = row_writer(Rates, 0)
 LOADS = np.array([ROBOT.drive_load_share] * 2 + [ROBOT.castor_load_share]) * WEIGHT_mN
 
 
@@ -390,6 +404,53 @@ def test_grip_scales_the_force_of_a_sliding_wheel():
         after, _ = run(ROBOT, start, memory, seconds=DT_S, floor=(0, 0, grip, grip, grip)).at(-1)
         slowed = grip * ROBOT.tyre.mu_dynamic * ROBOT.gravity_mm_s2 * DT_S
         assert start.v_x - after.v_x == pytest.approx(slowed, rel=1e-6)
+
+
+@driver
+def solve(
+    bodies: np.ndarray,
+    motions: np.ndarray,
+    torques: np.ndarray,
+    solved: np.ndarray,
+    begun: np.ndarray,
+) -> None:
+    """Velocities of a substep by sweeps, and those that belong to its impulses, (field, robot)."""
+    for i in range(motions.shape[1]):
+        robot, motion = read_body(bodies, 0, 0), read_motion(motions, i, 0)
+        memory, floor = NO_MEMORY, FLOOR
+        frame = substep_frame(
+            robot, motion, memory, floor, Push(0.0, 0.0, 0.0), torques[i, 0], torques[i, 1], DT_S
+        )
+        cos_p, sin_p, limits = frame.cos_p, frame.sin_p, frame.limits
+        after, impulses = sweep(robot, frame.free, memory, cos_p, sin_p, floor, limits)
+        again = begin_sweeps(robot, frame.free, impulses, cos_p, sin_p)
+        write_rates(solved, i, after)
+        write_rates(
+            begun,
+            i,
+            Rates(
+                again.v_e,
+                again.v_f,
+                again.w,
+                again.s,
+                again.omega_l,
+                again.omega_r,
+                again.omega_c,
+            ),
+        )
+
+
+def test_the_impulses_of_a_substep_give_its_velocities_at_once():
+    """So a substep that starts from the impulses of a solved one starts from its velocities."""
+    rng = np.random.default_rng(7)
+    starts = [random_start(rng, 10.0 ** rng.uniform(-3, 0)) for _ in range(60)]
+    motions = np.array(starts).T[:, :, None].copy()
+    torques = rng.uniform(-2e4, 2e4, (60, 2))
+    solved, begun = np.empty((2, len(Rates._fields), 60))
+    solve(np.array(body(ROBOT)).reshape(-1, 1, 1), motions, torques, solved, begun)
+    scale = np.array([[300.0, 300.0, 2.0, 5.0, 10.0, 10.0, 20.0]]).T
+    assert np.abs((begun - solved) / scale).max() < 1e-9
+    assert (np.abs(solved).max(axis=1) > 0.01 * scale[:, 0]).all()
 
 
 def test_a_payload_s_constants_are_the_first_of_the_body():

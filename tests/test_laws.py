@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from scipy.integrate import solve_ivp
 
 import tlf_env
-from tlf_env.onboard.calibration import Belief
+from tlf_env.onboard.calibration import Belief, believed_odometry, believed_wheel_speeds
 from tlf_env.onboard.controllers import controller
 from tlf_env.onboard.tracking import (
     body_errors,
@@ -290,11 +290,46 @@ def test_error_rates_on_the_kinematic_plant_are_eq_17():
         np.testing.assert_allclose(measured, expected, rtol=1e-6, atol=1e-3)
 
 
+def test_the_castor_of_the_kinematic_plant_rolls_without_slip():
+    """Its contact moves only along its wheel, wherever the robot heads and however the fork stands."""
+    rng = np.random.default_rng(6)
+    robot, dt = RobotParameters(), 1e-6
+
+    def contact(motion: Motion) -> np.ndarray:
+        x, y = axle_midpoint(motion, BODY.d)
+        pivot = robot.castor_pivot_mm * np.array([math.sin(motion.theta), -math.cos(motion.theta)])
+        trail = robot.castor_trail_mm * np.array([math.sin(motion.psi), -math.cos(motion.psi)])
+        return np.array([x, y]) + pivot + trail
+
+    for _ in range(50):
+        before = at_pose(*rng.uniform(-5, 5, 2), rng.uniform(-4, 4))
+        before = before._replace(psi=rng.uniform(-4, 4))
+        wheels = rng.uniform(-8, 8, 2)
+        after = follow_wheels(BODY, before, *wheels, 0.0, 0.0, dt)
+        across = np.array([math.cos(before.psi), math.sin(before.psi)])
+        velocity = (contact(after) - contact(before)) / dt
+        assert abs(velocity @ across) < 0.02  # of hundreds of mm/s
+        assert after.psi - before.psi == pytest.approx(dt * after.s, rel=1e-6)
+
+
 @untimed
 @given(st.floats(-1, 1), st.floats(-1, 1))
 def test_twist_command_inverts_eq_1(forward, turn):
     wheels = wheel_command(forward, turn, TWIST, BODY, BELIEF)
     np.testing.assert_allclose(EQ_1 @ wheels, (1000 * forward, 8 * turn), rtol=1e-12, atol=1e-12)
+
+
+@untimed
+@given(st.floats(0.9, 1.1), st.floats(0.9, 1.1), st.floats(0.9, 1.1), st.floats(-1, 1))
+def test_a_computer_finds_the_twist_that_it_asked_for_whatever_it_believes(left, right, axle, turn):
+    """Its odometry is that of wheels with the believed radii on the believed axle, eq. (1)."""
+    belief = Belief(radius_l=left, radius_r=right, h=axle * L_MM / 2)
+    wheels = believed_wheel_speeds(300.0, turn, BODY, belief)
+    radii = R_MM * np.array([left, right])
+    rows = np.array([[0.5, 0.5], [-1 / (axle * L_MM), 1 / (axle * L_MM)]]) * radii
+    np.testing.assert_allclose(rows @ wheels, (300.0, turn), rtol=1e-12, atol=1e-12)
+    found = believed_odometry(*wheels, BODY, belief)
+    np.testing.assert_allclose(found, (300.0, turn), rtol=1e-12, atol=1e-12)
 
 
 def test_wheel_speed_command_is_in_units_of_25_rad_s():

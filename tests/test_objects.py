@@ -15,6 +15,7 @@ import pytest
 import tlf_env
 from baselines import ReferencePolicy
 from tlf_env.physics.pymunk_plant import farthest_point
+from tlf_env.physics.reach import CALM_CHANGE_MM_S2, time_for, way
 
 WALL_Y_MM = 3300.0
 
@@ -390,3 +391,15 @@ def test_no_point_of_a_body_is_farther_away_at_any_angle_than_its_bound():
         assert reached == pytest.approx(bound, rel=1e-4)
     alone.center_of_gravity = (3.0, 4.0)
     assert farthest_point(alone) == pytest.approx(bound + 5.0)
+
+
+@pytest.mark.parametrize("speed_mm_s", [0.0, 120.0, 900.0])
+def test_the_way_in_a_time_and_the_time_for_a_way_are_inverse(speed_mm_s):
+    """And the way is what integrating the fastest change of speed gives."""
+    for time_s in (1e-3, 0.05, 2.0):
+        assert time_for(speed_mm_s, way(speed_mm_s, time_s)) == pytest.approx(time_s, rel=1e-9)
+        steps = np.linspace(0.0, time_s, 100_001)
+        speeds = speed_mm_s + CALM_CHANGE_MM_S2 * steps
+        assert way(speed_mm_s, time_s) == pytest.approx(np.trapezoid(speeds, steps), rel=1e-9)
+    assert time_for(speed_mm_s, 0.0) == 0.0
+    assert time_for(speed_mm_s, -5.0) == 0.0

@@ -525,6 +525,30 @@ def test_the_innovation_test_is_off_at_rest():
 
 # Slip read from the wheel speeds
 
+
+@pytest.mark.parametrize(
+    ("jump_1", "jump_2"), [(0.03, 0.0), (-0.02, 0.0), (0.0, 4e-4), (0.03, -4e-4)]
+)
+def test_a_jump_of_slip_is_known_to_a_tenth_of_its_size(jump_1, jump_2):
+    """Its uncertainty is a standard deviation of ``jump_uncertainty`` times the jump, mm and rad a sample."""
+    parameters = SlipEkfParameters(surprise_threshold=None, jump_uncertainty=0.1)
+    ekf = slip_ekf_constants(parameters, DT)
+    e, z = packed(np.zeros(5))
+    _, calm = predict_with_slip(e, z, ekf, 0.0, 0.0, 0.0, 0.0, DT)
+    _, jumped = predict_with_slip(e, z, ekf, jump_1, jump_2, 0.0, 0.0, DT)
+    for slip, before, after in (
+        (jumped.delta_1, calm.p_11, jumped.p_11),
+        (jumped.delta_2, calm.p_22, jumped.p_22),
+    ):
+        assert math.sqrt(max(after - before, 0.0)) == pytest.approx(0.1 * abs(slip), rel=1e-6)
+        assert after >= before
+        assert (slip == 0.0) == (after == before)
+    assert np.sign([jumped.delta_1, jumped.delta_2]).tolist() == [
+        -np.sign(jump_1),
+        -np.sign(jump_2),
+    ]
+
+
 changes = st.floats(-1.0, 1.0)
 MOST = 6.5e-4  # mm per sample and sample: 650 mm/s²
 

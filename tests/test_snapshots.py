@@ -28,7 +28,7 @@ from tlf_env.engine import snapshot as module
 from tlf_env.engine.arrays import FROM_SCENARIO
 from tlf_env.engine.formation import Formation
 from tlf_env.engine.snapshot import FORMAT, Snapshot, difference
-from tlf_env.onboard.memory import NotPlainError, packed, unpacked
+from tlf_env.onboard.memory import DEEPEST, NotPlainError, packed, unpacked
 
 ROOT = Path(__file__).parents[1]
 pytestmark = pytest.mark.filterwarnings("ignore::tlf_env.task.warn.ReferenceWarning")
@@ -932,12 +932,17 @@ def test_what_is_no_packed_value_is_refused(tree):
         unpacked(tree, {})
 
 
-def test_what_is_nested_too_deeply_is_refused():
+@pytest.mark.parametrize(
+    "around",
+    [lambda one: [one], lambda one: (one,), lambda one: {"key": one}, lambda one: deque([one])],
+)
+def test_what_is_nested_too_deeply_is_refused(around):
     value: Any = []
-    for _ in range(60):
-        value = [value]
+    for _ in range(DEEPEST):
+        value = around(value)
+    assert unpacked(packed(value, "name", {}, "value"), {}) == value
     with pytest.raises(NotPlainError, match="nested too deeply"):
-        packed(value, "name", {}, "value")
+        packed(around(value), "name", {}, "value")
 
 
 # --- a user's objects in the space --------------------------------------------------------------------

@@ -56,6 +56,24 @@ def approach(u: tuple[float, float], h: Predecessor) -> tuple[float, float, floa
 # The law
 
 
+@pytest.mark.parametrize("gain_per_s", [0.5, 2.0, 6.0])
+def test_an_approach_decelerates_at_most_as_the_brakes_can(gain_per_s):
+    """Towards a centre that stands: speed times slope is the deceleration; far away it is the brakes'."""
+    row = spacing_row(Spacing(gain_per_s=gain_per_s, braking_mm_s2=80.0))
+    room = np.geomspace(1e-3, 1e4, 400)
+    step = 1e-5 * room
+
+    def speed(at: np.ndarray) -> np.ndarray:
+        return np.array([approach_speed(one, 0.0, row) for one in at.tolist()])
+
+    slope = (speed(room + step) - speed(room - step)) / (2.0 * step)
+    deceleration = speed(room) * slope
+    assert slope[0] == pytest.approx(gain_per_s, rel=1e-6)
+    assert (np.diff(slope) < 1e-6 * gain_per_s).all()
+    assert (deceleration < 80.0 * (1.0 + 1e-5)).all()
+    assert deceleration[-60:] == pytest.approx(80.0, rel=1e-5)
+
+
 @untimed
 @given(twists, places, places, turns, twists)
 def test_the_twist_approaches_no_faster_than_allowed_and_otherwise_is_left(u, x, y, turn, other):

@@ -8,6 +8,7 @@ import math
 import pickle
 
 import numpy as np
+import pymunk
 import pytest
 
 import tlf_env
@@ -58,6 +59,25 @@ def test_a_wall_returns_the_speed_that_restitution_says(own, walls):
     v_x, v_y, yaw = flight.velocity()
     assert v_y == pytest.approx(-own * walls * 400.0, abs=0.02)
     assert (v_x, yaw) == pytest.approx((0.0, 0.0), abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("force_mN", "torque"), [((3000.0, -500.0), 0.0), ((0.0, 0.0), 4e5), ((0.0, 800.0), -1e5)]
+)
+def test_a_force_on_a_body_acts_for_the_whole_control_step(force_mN, torque):
+    """Chipmunk forgets forces after each of its steps; a body gains force times time, not times a substep."""
+    flight = Flight()
+    body, shape_less = pymunk.Body(2.0, 3e4), pymunk.Body(1.0, 1.0)
+    flight.plant.space(flight.motions, 0).add(body, pymunk.Circle(body, 50.0), shape_less)
+    body.position = 2000.0, 0.0
+    body.force, body.torque = force_mN, torque
+    flight.fly(0.02)
+    assert tuple(body.velocity) == pytest.approx(
+        (0.02 * force_mN[0] / 2.0, 0.02 * force_mN[1] / 2.0), rel=1e-12
+    )
+    assert body.angular_velocity == pytest.approx(0.02 * torque / 3e4, rel=1e-12)
+    assert tuple(shape_less.velocity) == (0.0, 0.0)
+    assert not flight.velocity().any()
 
 
 @pytest.mark.parametrize("friction", [0.0, 0.1, 0.4])
