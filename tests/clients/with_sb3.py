@@ -2,104 +2,20 @@
 
 from __future__ import annotations
 
-from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 import rung
-import torch
 from sb3_contrib import TQC, CrossQ, RecurrentPPO
+from sb3_models import OFF_POLICY, ON_POLICY, OfSB3
 from stable_baselines3 import PPO, SAC, TD3
-from stable_baselines3.common.callbacks import BaseCallback
 from stable_baselines3.common.noise import NormalActionNoise
-
-from baselines.sb3 import FormationVecEnv
-
-ON_POLICY = {"n_steps": 128, "batch_size": 512, "learning_rate": 1e-3}
-OFF_POLICY = {
-    "learning_starts": 1000,
-    "batch_size": 128,
-    "gradient_steps": 4,  # of a step of all formations
-    "learning_rate": 1e-3,
-    "gamma": 0.95,
-}
-FORMATIONS = 16
-
-
-def side_by_side(formations: int) -> FormationVecEnv:
-    """Formations on the batch plant, whose episodes end at different times."""
-    return FormationVecEnv(rung.TASK, formations, staggered=True, infos=False, **rung.RUNG)
-
-
-class Losses(BaseCallback):
-    """The losses that the learner logs, after each rollout."""
-
-    def __init__(self) -> None:
-        super().__init__()
-        self.found: list[float] = []
-
-    def _on_step(self) -> bool:
-        return True
-
-    def _on_rollout_end(self) -> None:
-        values = self.logger.name_to_value
-        self.found += [float(value) for name, value in values.items() if "loss" in name]
-
-
-class OfSB3(rung.Client):
-    """A model with the interface of stable-baselines3."""
-
-    library, package = "Stable-baselines3", "stable-baselines3"
-    door = "`FormationVecEnv`"
-    kind: ClassVar[Any]
-    policy = "MlpPolicy"
-    formations = FORMATIONS
-    settings: ClassVar[dict[str, Any]] = {}
-
-    def environment(self) -> Any:
-        """What the model is trained on."""
-        return side_by_side(self.formations)
-
-    def __init__(self) -> None:
-        torch.set_num_threads(1)
-        self.model = self.kind(
-            self.policy, self.environment(), seed=rung.SEED, device="cpu", **self.settings
-        )
-
-    def _acting(self, model: Any) -> rung.Act:
-        state = None
-
-        def act(observation: np.ndarray, first: bool) -> np.ndarray:
-            nonlocal state
-            action, state = model.predict(
-                observation[None],
-                state=None if first else state,
-                episode_start=np.array([first]),
-                deterministic=True,
-            )
-            return action[0]
-
-        return act
-
-    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:  # noqa: D102
-        if first:
-            self._act = self._acting(self.model)
-        return self._act(observation, first)
-
-    def learn(self) -> list[float]:  # noqa: D102
-        losses = Losses()
-        self.model.learn(self.steps, callback=losses)
-        return losses.found
-
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
-        self.model.save(folder / "model")
-        return self._acting(self.kind.load(folder / "model", device="cpu"))
 
 
 class PPOSideBySide(OfSB3):
     """PPO on formations side by side."""
 
-    algorithm, kind, steps, settings = "PPO", PPO, 80_000, ON_POLICY
+    algorithm, kind, steps, settings = "PPO", PPO, 60_000, ON_POLICY
 
 
 class PPOAlone(OfSB3):
@@ -116,13 +32,13 @@ class PPOAlone(OfSB3):
 class SACSideBySide(OfSB3):
     """SAC on formations side by side."""
 
-    algorithm, kind, steps, settings = "SAC", SAC, 10_000, OFF_POLICY
+    algorithm, kind, steps, settings = "SAC", SAC, 8_000, OFF_POLICY
 
 
 class TD3SideBySide(OfSB3):
     """TD3 on formations side by side, with noise on its actions."""
 
-    algorithm, kind, steps = "TD3", TD3, 10_000
+    algorithm, kind, steps = "TD3", TD3, 8_000
     settings: ClassVar[dict[str, Any]] = {
         **OFF_POLICY,
         "action_noise": NormalActionNoise(np.zeros(2), np.full(2, 0.3)),
@@ -138,7 +54,7 @@ class OfContrib(OfSB3):
 class Recurrent(OfContrib):
     """PPO with an LSTM."""
 
-    algorithm, kind, steps = "RecurrentPPO", RecurrentPPO, 40_000
+    algorithm, kind, steps = "RecurrentPPO", RecurrentPPO, 20_000
     policy = "MlpLstmPolicy"
     settings: ClassVar[dict[str, Any]] = {**ON_POLICY, "n_epochs": 4}
 
@@ -146,13 +62,13 @@ class Recurrent(OfContrib):
 class TQCSideBySide(OfContrib):
     """TQC on formations side by side."""
 
-    algorithm, kind, steps, settings = "TQC", TQC, 8_000, OFF_POLICY
+    algorithm, kind, steps, settings = "TQC", TQC, 6_000, OFF_POLICY
 
 
 class CrossQSideBySide(OfContrib):
     """CrossQ on formations side by side."""
 
-    algorithm, kind, steps, settings = "CrossQ", CrossQ, 8_000, OFF_POLICY
+    algorithm, kind, steps, settings = "CrossQ", CrossQ, 6_000, OFF_POLICY
 
 
 CLIENTS = (

@@ -111,6 +111,7 @@ class WithSkrl(rung.Client):
             cfg={
                 "timesteps": self.steps // ENVS,
                 "disable_progressbar": True,
+                "headless": True,  # otherwise it draws by a method that no vector entry point has
                 "close_environment_at_exit": False,
             },
         )
