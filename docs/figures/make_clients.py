@@ -1,8 +1,8 @@
-"""Write the tables of ``docs/compatibility.md`` from runs of client libraries: ``python docs/figures/make_clients.py``.
+"""Write the tables of ``docs/compatibility.md`` from runs of client libraries.
 
-``make clients`` trains with every library and writes ``results/clients/NAME.json``. What is found there is kept in
-``docs/compatibility.json``, by the name of the environment; what is not found stays as it was. The tables are
-made from that file alone.
+``make clients`` trains with every library and writes ``results/clients/NAME.json``. ``python
+docs/figures/make_clients.py`` keeps what is found there in ``docs/compatibility.json``, by the name of the
+environment; what is not found stays as it was. The tables are made from that file alone.
 """
 
 from __future__ import annotations

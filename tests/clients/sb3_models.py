@@ -78,16 +78,16 @@ class OfSB3(rung.Client):
 
         return act
 
-    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:  # noqa: D102
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
         if first:
             self._act = self._acting(self.model)
         return self._act(observation, first)
 
-    def learn(self) -> list[float]:  # noqa: D102
+    def learn(self) -> list[float]:
         losses = Losses()
         self.model.learn(self.steps, callback=losses)
         return losses.found
 
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
+    def loaded(self, folder: Path) -> rung.Act:
         self.model.save(folder / "model")
         return self._acting(self.kind.load(folder / "model", device="cpu"))

@@ -50,10 +50,10 @@ class WithAgileRL(rung.Client):
 
         return act
 
-    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:  # noqa: D102
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
         return self._acting(self.agent)(observation, first)
 
-    def learn(self) -> list[float]:  # noqa: D102
+    def learn(self) -> list[float]:
         learn, losses = self.agent.learn, []
 
         def kept(experiences: Any) -> dict[str, float]:
@@ -75,12 +75,12 @@ class WithAgileRL(rung.Client):
         del self.agent.learn
         return losses
 
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
+    def loaded(self, folder: Path) -> rung.Act:
         file = os.fspath(folder / "agent.pt")
         self.agent.save_checkpoint(file)
         return self._acting(IPPO.load(file))
 
-    def close(self) -> None:  # noqa: D102
+    def close(self) -> None:
         self.env.close()
 
 

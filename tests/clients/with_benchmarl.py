@@ -26,7 +26,7 @@ class Losses(Callback):
         super().__init__()
         self.found: list[float] = []
 
-    def on_train_end(self, training_td: TensorDict, group: str) -> None:  # noqa: D102
+    def on_train_end(self, training_td: TensorDict, group: str) -> None:
         self.found += [
             float(value.mean()) for name, value in training_td.items() if "loss" in str(name)
         ]
@@ -35,7 +35,7 @@ class Losses(Callback):
 class WithBenchMARL(rung.Client):
     """IPPO on formations side by side."""
 
-    library, package, algorithm, steps = "BenchMARL", "benchmarl", "IPPO", 20 * FRAMES
+    library, package, algorithm, steps = "BenchMARL", "benchmarl", "IPPO", 10 * FRAMES
     door = "`baselines.benchmarl`"
 
     def __init__(self) -> None:
@@ -53,7 +53,7 @@ class WithBenchMARL(rung.Client):
         config.max_n_iters, config.max_n_frames = None, self.steps
         config.on_policy_collected_frames_per_batch = FRAMES
         config.on_policy_n_envs_per_worker = 32
-        config.on_policy_minibatch_size, config.on_policy_n_minibatch_iters = 256, 8
+        config.on_policy_minibatch_size, config.on_policy_n_minibatch_iters = 256, 6
         config.lr, config.restore_file = 1e-3, restored
         return Experiment(
             task=task,
@@ -75,15 +75,17 @@ class WithBenchMARL(rung.Client):
 
         return act
 
-    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:  # noqa: D102
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
         return self._acting(self.experiment)(observation, first)
 
-    def learn(self) -> list[float]:  # noqa: D102
+    def learn(self) -> list[float]:
         self.experiment.run()
         return self.losses.found
 
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
-        newest = max(Path(self.folder).rglob("checkpoint_*.pt"), key=lambda path: path.stat().st_mtime)
+    def loaded(self, folder: Path) -> rung.Act:
+        newest = max(
+            Path(self.folder).rglob("checkpoint_*.pt"), key=lambda path: path.stat().st_mtime
+        )
         return self._acting(self._experiment(str(newest)))
 
 

@@ -1,8 +1,8 @@
-"""Wrappers of Gymnasium and SuperSuit; and PPO in plain torch on ``gymnasium.make_vec``, in the form of CleanRL.
+"""Wrappers of Gymnasium and SuperSuit; and PPO in plain torch on ``gymnasium.make_vec``, as CleanRL has it.
 
-The loop is that of CleanRL's ``ppo_continuous_action.py``, without its logging, and for environments that end in
-one step and begin anew in the next (Gymnasium's autoreset mode ``NextStep``): the step of a new beginning is
-left out of the losses.
+The loop is that of CleanRL's ``ppo_continuous_action.py``, without its logging, and for environments that end
+in one step and begin anew in the next (Gymnasium's autoreset mode ``NextStep``): the step of a new beginning
+is left out of the losses.
 """
 
 from __future__ import annotations
@@ -70,10 +70,10 @@ class CleanLoop(rung.Client):
 
         return act
 
-    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:  # noqa: D102
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
         return self._acting(self.agent)(observation, first)
 
-    def learn(self) -> list[float]:  # noqa: D102
+    def learn(self) -> list[float]:
         agent, losses = self.agent, []
         optimiser = torch.optim.Adam(agent.parameters(), RATE, eps=1e-5)
         seen = torch.as_tensor(self.envs.reset(seed=rung.SEED)[0])
@@ -124,13 +124,13 @@ class CleanLoop(rung.Client):
                     losses.append(loss.item())
         return losses
 
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
+    def loaded(self, folder: Path) -> rung.Act:
         torch.save(self.agent.state_dict(), folder / "agent.pt")
         other = Agent(*self.sizes)
         other.load_state_dict(torch.load(folder / "agent.pt", weights_only=True))
         return self._acting(other)
 
-    def close(self) -> None:  # noqa: D102
+    def close(self) -> None:
         self.envs.close()
 
 

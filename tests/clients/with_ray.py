@@ -30,7 +30,7 @@ TRAINING = {
 class OfRLlib(rung.Client):
     """PPO with runners in the same process."""
 
-    library, package, algorithm, steps = "RLlib", "ray", "PPO", 20_000
+    library, package, algorithm, steps = "RLlib", "ray", "PPO", 12_000
     module_id = "default_policy"
 
     def config(self) -> PPOConfig:
@@ -58,23 +58,23 @@ class OfRLlib(rung.Client):
 
         return act
 
-    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:  # noqa: D102
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
         return self._acting(self.learner.get_module(self.module_id))(observation, first)
 
-    def learn(self) -> list[float]:  # noqa: D102
+    def learn(self) -> list[float]:
         losses = []
         for _ in range(self.steps // BATCH):
             found = self.learner.train()["learners"][self.module_id]
             losses += [float(found[name]) for name in ("total_loss", "policy_loss", "vf_loss")]
         return losses
 
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
+    def loaded(self, folder: Path) -> rung.Act:
         path = os.fspath(folder / "algorithm")
         self.learner.save_to_path(path)
         self.other = Algorithm.from_checkpoint(path)
         return self._acting(self.other.get_module(self.module_id))
 
-    def close(self) -> None:  # noqa: D102
+    def close(self) -> None:
         for learner in (self.learner, getattr(self, "other", None)):
             if learner is not None:
                 learner.stop()
@@ -92,7 +92,7 @@ class Parallel(OfRLlib):
 
     door, module_id = "`parallel_env`", "robots"
 
-    def config(self) -> PPOConfig:  # noqa: D102
+    def config(self) -> PPOConfig:
         register_env("rung", lambda _: ParallelPettingZooEnv(rung.parallel()))
 
         def policy(*_: Any, **__: Any) -> str:

@@ -28,7 +28,7 @@ class SAC(OfSBX):
 class CrossQ(OfSBX):
     """CrossQ on formations side by side."""
 
-    algorithm, kind, steps, settings = "CrossQ", sbx.CrossQ, 10_000, OFF_POLICY
+    algorithm, kind, steps, settings = "CrossQ", sbx.CrossQ, 6_000, OFF_POLICY
 
 
 class Alone(OfSBX):
@@ -37,7 +37,7 @@ class Alone(OfSBX):
     algorithm, kind, steps, settings = "PPO", sbx.PPO, 20_000, {"learning_rate": 1e-3}
     door = "`gymnasium.make`"
 
-    def environment(self) -> object:  # noqa: D102
+    def environment(self) -> object:
         return rung.single()
 
 

@@ -36,7 +36,7 @@ class Policy(GaussianMixin, Model):
         self.net = network(self.num_observations, self.num_actions)
         self.log_std = nn.Parameter(torch.zeros(self.num_actions))
 
-    def compute(self, inputs: dict[str, Any], role: str = "") -> tuple[Any, dict[str, Any]]:  # noqa: D102
+    def compute(self, inputs: dict[str, Any], role: str = "") -> tuple[Any, dict[str, Any]]:
         return self.net(inputs["observations"]), {"log_std": self.log_std}
 
 
@@ -48,7 +48,7 @@ class Value(DeterministicMixin, Model):
         DeterministicMixin.__init__(self)
         self.net = network(self.num_observations, 1)
 
-    def compute(self, inputs: dict[str, Any], role: str = "") -> tuple[Any, dict[str, Any]]:  # noqa: D102
+    def compute(self, inputs: dict[str, Any], role: str = "") -> tuple[Any, dict[str, Any]]:
         return self.net(inputs["observations"]), {}
 
 
@@ -92,10 +92,10 @@ class WithSkrl(rung.Client):
 
         return act
 
-    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:  # noqa: D102
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
         return self._acting(self.agent)(observation, first)
 
-    def learn(self) -> list[float]:  # noqa: D102
+    def learn(self) -> list[float]:
         losses: list[float] = []
         track = self.agent.track_data
 
@@ -118,7 +118,7 @@ class WithSkrl(rung.Client):
         trainer.train()
         return losses
 
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
+    def loaded(self, folder: Path) -> rung.Act:
         self.agent.save(str(folder / "agent.pt"))
         other = self._agent()
         other.load(str(folder / "agent.pt"))

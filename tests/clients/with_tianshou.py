@@ -28,7 +28,7 @@ def distribution(mean_and_std: tuple[torch.Tensor, torch.Tensor]) -> Any:
 class WithTianshou(rung.Client):
     """PPO on a few environments of one learner."""
 
-    library, package, algorithm, steps = "Tianshou", "tianshou", "PPO", 20_000
+    library, package, algorithm, steps = "Tianshou", "tianshou", "PPO", 16_000
     door = "`gymnasium.make`"
 
     def __init__(self) -> None:
@@ -41,7 +41,9 @@ class WithTianshou(rung.Client):
         seen, acted = self.env.observation_space.shape, self.env.action_space.shape
         policy = ProbabilisticActorPolicy(
             actor=ContinuousActorProbabilistic(
-                preprocess_net=Net(state_shape=seen, hidden_sizes=[64, 64], activation=torch.nn.Tanh),
+                preprocess_net=Net(
+                    state_shape=seen, hidden_sizes=[64, 64], activation=torch.nn.Tanh
+                ),
                 action_shape=acted,
                 unbounded=True,
             ),
@@ -66,10 +68,10 @@ class WithTianshou(rung.Client):
 
         return act
 
-    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:  # noqa: D102
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
         return self._acting(self.learner)(observation, first)
 
-    def learn(self) -> list[float]:  # noqa: D102
+    def learn(self) -> list[float]:
         losses: list[float] = []
         update = self.learner._update_with_batch
 
@@ -96,7 +98,7 @@ class WithTianshou(rung.Client):
         )
         return losses
 
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
+    def loaded(self, folder: Path) -> rung.Act:
         torch.save(self.learner.state_dict(), folder / "learner.pt")
         other = self._learner()
         other.load_state_dict(torch.load(folder / "learner.pt", weights_only=False))

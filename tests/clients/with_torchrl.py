@@ -8,7 +8,7 @@ import numpy as np
 import rung
 import torch
 from tensordict import TensorDict
-from tensordict.nn import NormalParamExtractor, TensorDictModule
+from tensordict.nn import InteractionType, NormalParamExtractor, TensorDictModule
 from torch import nn
 from torchrl.modules import ProbabilisticActor, TanhNormal, ValueOperator
 from torchrl.objectives import ClipPPOLoss, ValueEstimators
@@ -67,6 +67,7 @@ class WithTorchRL(rung.Client):
             out_keys=[ACTED],
             spec=self.env.action_spec,
             distribution_class=TanhNormal,
+            default_interaction_type=InteractionType.RANDOM,
             return_log_prob=True,
             log_prob_key=("robot", "log_prob"),
         )
@@ -81,10 +82,10 @@ class WithTorchRL(rung.Client):
 
         return act
 
-    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:  # noqa: D102
+    def act(self, observation: np.ndarray, first: bool) -> np.ndarray:
         return self._acting(self.actor)(observation, first)
 
-    def learn(self) -> list[float]:  # noqa: D102
+    def learn(self) -> list[float]:
         optimiser = torch.optim.Adam(self.loss.parameters(), 1e-3)
         losses: list[float] = []
         begun = self.env.reset()
@@ -112,7 +113,7 @@ class WithTorchRL(rung.Client):
                     losses.append(total.item())
         return losses
 
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
+    def loaded(self, folder: Path) -> rung.Act:
         torch.save(self.actor.state_dict(), folder / "actor.pt")
         other = self._actor()
         other.load_state_dict(torch.load(folder / "actor.pt", weights_only=True))

@@ -21,17 +21,17 @@ class ByZoo(OfSB3):
     """PPO, trained by ``python -m rl_zoo3.train``."""
 
     library, package, algorithm, kind = "rl-baselines3-zoo", "rl_zoo3", "PPO", PPO
-    door, steps = "`gymnasium.make`, by `--gym-packages tlf_env`", 20_000
+    door, steps = "`gymnasium.make`, by `--gym-packages tlf_env`", 10_000
     remark = "the numbers are a file, `tests/clients/zoo.yaml`"
 
     def __init__(self) -> None:
         super().__init__()
         self.logs = Path(tempfile.mkdtemp())
 
-    def environment(self) -> Any:  # noqa: D102
+    def environment(self) -> Any:
         return rung.single()
 
-    def learn(self) -> list[float]:  # noqa: D102
+    def learn(self) -> list[float]:
         arguments = [f"{name}:{value!r}" for name, value in {**rung.RUNG, "infos": False}.items()]
         words = ["--algo", "ppo", "--env", ID, "--gym-packages", "tlf_env"]
         words += ["--conf-file", str(HYPERPARAMETERS), "--log-folder", str(self.logs)]
@@ -49,7 +49,7 @@ class ByZoo(OfSB3):
         self.model = PPO.load(self.file, device="cpu")
         return [float(value) for value in re.findall(r"loss +\| (\S+)", done.stdout)]
 
-    def loaded(self, folder: Path) -> rung.Act:  # noqa: D102
+    def loaded(self, folder: Path) -> rung.Act:
         return self._acting(PPO.load(self.file, device="cpu"))
 
 

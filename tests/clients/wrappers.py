@@ -1,4 +1,4 @@
-"""Wrappers of Gymnasium and SuperSuit that fit the environment: each runs past an end, or it is seen why not."""
+"""Wrappers of Gymnasium and SuperSuit that fit the environment: each runs past two ends, or says why not."""
 
 from __future__ import annotations
 
@@ -131,9 +131,7 @@ SUPERSUIT = {
     ),
     "pad_action_space_v0": Kind(lambda m, e: m.pad_action_space_v0(e)),
     "pad_observations_v0": Kind(lambda m, e: m.pad_observations_v0(e)),
-    "reshape_v0": Kind(
-        lambda m, e: m.reshape_v0(e, (e.observation_space("robot_0").shape[0], 1))
-    ),
+    "reshape_v0": Kind(lambda m, e: m.reshape_v0(e, (e.observation_space("robot_0").shape[0], 1))),
     "reward_lambda_v0": Kind(lambda m, e: m.reward_lambda_v0(e, lambda r: 0.1 * r)),
     "sticky_actions_v0": Kind(lambda m, e: m.sticky_actions_v0(e, 0.3)),
 }
