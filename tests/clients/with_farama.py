@@ -136,7 +136,7 @@ class CleanLoop(rung.Client):
 
 def checks() -> list[dict[str, str]]:
     """What each wrapper does."""
-    return outcomes()
+    return list(outcomes())
 
 
 CLIENTS = (CleanLoop,)

@@ -21,7 +21,7 @@ class ByZoo(OfSB3):
     """PPO, trained by ``python -m rl_zoo3.train``."""
 
     library, package, algorithm, kind = "rl-baselines3-zoo", "rl_zoo3", "PPO", PPO
-    door, steps = "`gymnasium.make`, by `--gym-packages tlf_env`", 10_000
+    door, steps = "`gymnasium.make`, by `--gym-packages tlf_env`", 20_000
     remark = "the numbers are a file, `tests/clients/zoo.yaml`"
 
     def __init__(self) -> None:

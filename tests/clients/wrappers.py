@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from importlib.metadata import version
 from typing import Any, NamedTuple
 
@@ -258,20 +258,15 @@ def outcome(group: str, name: str) -> str:
     return ""
 
 
-def outcomes() -> list[dict[str, str]]:
+def outcomes() -> Iterator[dict[str, str]]:
     """A row for each wrapper."""
-    return [
-        {
-            "group": group,
-            "wrapper": name,
-            "version": version(group.partition(",")[0].lower()),
-            "error": outcome(group, name),
-        }
-        for group, kinds in GROUPS.items()
-        for name in kinds
-    ]
+    for group, kinds in GROUPS.items():
+        for name in kinds:
+            installed = version(group.partition(",")[0].lower())
+            error = outcome(group, name)
+            yield {"group": group, "wrapper": name, "version": installed, "error": error}
 
 
 if __name__ == "__main__":
     for row in outcomes():
-        print(row)
+        print(row, flush=True)
