@@ -52,7 +52,7 @@ def mean(values: list[float]) -> str:
 
 
 def trainings(result: Result) -> str:
-    """A row for each training."""
+    """A row for each training, and one for each environment without any."""
     head = ["library", "version", "algorithm", "by", "steps", "before", "after", "rises"]
     head += ["when loaded", "seconds", "Python"]
     rows = []
@@ -74,6 +74,9 @@ def trainings(result: Result) -> str:
                     python,
                 ]
             )
+    for name in ORDER:
+        if name not in result:
+            rows.append([f"`{name}`", *["not run"] * 3, *[""] * (len(head) - 4)])
     return table(head, rows, names=4)
 
 

@@ -19,7 +19,7 @@ AGENT = "robot_0"
 class WithAgileRL(rung.Client):
     """IPPO in the process of the environment."""
 
-    library, package, algorithm, steps = "AgileRL", "agilerl", "IPPO", 10_000
+    library, package, algorithm, steps = "AgileRL", "agilerl", "IPPO", 6_144
     door = "`parallel_env`"
 
     def __init__(self) -> None:

@@ -30,7 +30,7 @@ TRAINING = {
 class OfRLlib(rung.Client):
     """PPO with runners in the same process."""
 
-    library, package, algorithm, steps = "RLlib", "ray", "PPO", 12_000
+    library, package, algorithm, steps = "RLlib", "ray", "PPO", 8_000
     module_id = "default_policy"
 
     def config(self) -> PPOConfig:

@@ -28,7 +28,7 @@ def distribution(mean_and_std: tuple[torch.Tensor, torch.Tensor]) -> Any:
 class WithTianshou(rung.Client):
     """PPO on a few environments of one learner."""
 
-    library, package, algorithm, steps = "Tianshou", "tianshou", "PPO", 16_000
+    library, package, algorithm, steps = "Tianshou", "tianshou", "PPO", 8_192
     door = "`gymnasium.make`"
 
     def __init__(self) -> None:
