@@ -74,9 +74,8 @@ def trainings(result: Result) -> str:
                     python,
                 ]
             )
-    for name in ORDER:
-        if name not in result:
-            rows.append([f"`{name}`", *["not run"] * 3, *[""] * (len(head) - 4)])
+    missing = [name for name in ORDER if name not in result]
+    rows += [[f"`{name}`", *["not run"] * 3, *[""] * (len(head) - 4)] for name in missing]
     return table(head, rows, names=4)
 
 

@@ -1,8 +1,8 @@
 """Train on the first rung with the libraries of one environment: ``python tests/clients/run.py sb3``.
 
-The rows of the table of ``docs/compatibility.md`` go to ``results/clients/NAME.json``, after each training; a
-training that is there already, with the same version, is not run again. ``make clients`` calls this in an
-environment for each file ``NAME.txt`` of this folder.
+The rows of the table of ``docs/compatibility.md`` go to ``results/clients/NAME.json``, after each training.
+``--resume`` leaves out a training that is there already, with the same version. ``make clients`` calls this
+in an environment for each file ``NAME.txt`` of this folder.
 """
 
 from __future__ import annotations
@@ -33,11 +33,13 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("client", help="a file of this folder, without .txt")
     parser.add_argument("--out", type=Path, default=Path("results/clients"))
+    parser.add_argument("--resume", action="store_true", help="keep what is finished")
     given = parser.parse_args()
     warnings.simplefilter("ignore")  # of the libraries, about each other
     module = importlib.import_module(f"with_{given.client}")
     path = given.out / f"{given.client}.json"
-    earlier = json.loads(path.read_text(encoding="utf-8"))["trainings"] if path.exists() else []
+    resumed = given.resume and path.exists()
+    earlier = json.loads(path.read_text(encoding="utf-8"))["trainings"] if resumed else []
     kept = {key(row): row for row in earlier}
     made: dict[str, Any] = {"checks": getattr(module, "checks", list)(), "trainings": []}
     failed = sum(bool(row["error"]) for row in made["checks"])
