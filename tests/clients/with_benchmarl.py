@@ -40,7 +40,8 @@ class WithBenchMARL(rung.Client):
 
     def __init__(self) -> None:
         torch.set_num_threads(1)
-        self.folder = tempfile.mkdtemp()
+        self.kept = tempfile.TemporaryDirectory()
+        self.folder = self.kept.name
         self.losses = Losses()
         self.experiment = self._experiment()
 

@@ -32,13 +32,13 @@ class PPOAlone(OfSB3):
 class SACSideBySide(OfSB3):
     """SAC on formations side by side."""
 
-    algorithm, kind, steps, settings = "SAC", SAC, 4_000, OFF_POLICY
+    algorithm, kind, steps, settings = "SAC", SAC, 10_000, OFF_POLICY
 
 
 class TD3SideBySide(OfSB3):
     """TD3 on formations side by side, with noise on its actions."""
 
-    algorithm, kind, steps = "TD3", TD3, 4_000
+    algorithm, kind, steps = "TD3", TD3, 8_000
     settings: ClassVar[dict[str, Any]] = {
         **OFF_POLICY,
         "action_noise": NormalActionNoise(np.zeros(2), np.full(2, 0.3)),
@@ -62,21 +62,21 @@ class Recurrent(OfContrib):
 class TQCSideBySide(OfContrib):
     """TQC on formations side by side."""
 
-    algorithm, kind, steps, settings = "TQC", TQC, 4_000, OFF_POLICY
+    algorithm, kind, steps, settings = "TQC", TQC, 8_000, OFF_POLICY
 
 
 class CrossQSideBySide(OfContrib):
     """CrossQ on formations side by side."""
 
-    algorithm, kind, steps, settings = "CrossQ", CrossQ, 4_000, OFF_POLICY
+    algorithm, kind, steps, settings = "CrossQ", CrossQ, 8_000, OFF_POLICY
 
 
 CLIENTS = (
     PPOSideBySide,
     PPOAlone,
     SACSideBySide,
-    TD3SideBySide,
     Recurrent,
     TQCSideBySide,
     CrossQSideBySide,
+    TD3SideBySide,
 )

@@ -26,7 +26,8 @@ class ByZoo(OfSB3):
 
     def __init__(self) -> None:
         super().__init__()
-        self.logs = Path(tempfile.mkdtemp())
+        self.kept = tempfile.TemporaryDirectory()
+        self.logs = Path(self.kept.name)
 
     def environment(self) -> Any:
         return rung.single()
