@@ -87,6 +87,8 @@ def test_a_wrapper_runs_past_two_ends(
         needed("pygame")
     if name == "ObstructView":
         needed("cv2")
+    if not wrappers.exists(group, name) and "gymnasium" not in REQUIRED:
+        pytest.skip(f"this version of {group} has no {name}")
     assert wrappers.outcome(group, name) == ""
 
 

@@ -54,7 +54,7 @@ class OfContrib(OfSB3):
 class Recurrent(OfContrib):
     """PPO with an LSTM."""
 
-    algorithm, kind, steps = "RecurrentPPO", RecurrentPPO, 8_000
+    algorithm, kind, steps = "RecurrentPPO", RecurrentPPO, 24_000
     policy = "MlpLstmPolicy"
     settings: ClassVar[dict[str, Any]] = {**ON_POLICY, "n_epochs": 4}
 

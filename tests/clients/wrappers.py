@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import re
 import tempfile
 from collections.abc import Callable, Iterator
@@ -147,6 +148,15 @@ GROUPS = {
     "SuperSuit": SUPERSUIT,
     "SuperSuit, to vectors": SUPERSUIT_VECTORS,
 }
+
+
+def exists(group: str, name: str) -> bool:
+    """Whether the installed version has a wrapper: Gymnasium 1.2 does not have all that 1.4 has."""
+    modules = {
+        "Gymnasium": "gymnasium.wrappers",
+        "Gymnasium, vector": "gymnasium.wrappers.vector",
+    }
+    return hasattr(importlib.import_module(modules.get(group, "supersuit")), name)
 
 
 def finite(values: Any) -> bool:
