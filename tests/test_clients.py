@@ -541,8 +541,14 @@ def test_the_page_has_the_versions_that_are_installed_for_the_check() -> None:
     assert {"supersuit", "minari", "ray", "torchrl", "tianshou"} <= set(shown) & set(fixed)
 
 
+def page_maker() -> Any:
+    """The module that writes the tables; like the other makers of pages, it imports matplotlib."""
+    pytest.importorskip("matplotlib")
+    return importlib.import_module("make_clients")
+
+
 def test_the_tables_are_those_of_the_runs() -> None:
-    make_clients = importlib.import_module("make_clients")
+    make_clients = page_maker()
     for name, made in (
         ("trainings of clients", make_clients.trainings(RESULT)),
         ("wrappers", make_clients.wrappers(RESULT)),
@@ -552,7 +558,7 @@ def test_the_tables_are_those_of_the_runs() -> None:
 
 def test_every_training_is_of_the_fixed_version_and_acts_the_same_when_loaded() -> None:
     assert set(RESULT) <= set(CLIENTS)
-    assert set(importlib.import_module("make_clients").ORDER) == set(CLIENTS)
+    assert set(page_maker().ORDER) == set(CLIENTS)
     for client, runs in RESULT.items():
         assert runs["trainings"]
         for run in runs["trainings"]:
@@ -562,7 +568,7 @@ def test_every_training_is_of_the_fixed_version_and_acts_the_same_when_loaded() 
 
 
 def test_a_folder_of_new_runs_replaces_the_earlier_ones(tmp_path: Path) -> None:
-    make_clients = importlib.import_module("make_clients")
+    make_clients = page_maker()
     changed = {"checks": [], "trainings": []}
     (tmp_path / "ray.json").write_text(json.dumps(changed), encoding="utf-8")
     merged = make_clients.merged(RESULT, tmp_path)
