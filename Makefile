@@ -13,7 +13,7 @@ PIP := $(BIN)/python -m pip install -q --disable-pip-version-check
 
 .DEFAULT_GOAL := help
 .DELETE_ON_ERROR:
-.PHONY: help run compile test test-slow test-learning check check-audit check-docs check-install check-lowest check-clients check-pages check-paper check-faults check-fuzz check-endurance check-mutants check-stress browser check-live docs format board speed speed-docs constraints clean
+.PHONY: help run compile test test-slow test-learning check check-audit check-docs check-install check-lowest clients check-clients check-pages check-paper check-faults check-fuzz check-endurance check-mutants check-stress browser check-live docs format board speed speed-docs constraints clean
 
 help: ## List the targets
 	@sed -n 's/^\([a-z-]*\):.*## \(.*\)/make \1|\2/p' $(MAKEFILE_LIST) | \
@@ -88,7 +88,8 @@ check-install: ## Build sdist and wheel, and play the first hour in a clean envi
 	PATH="$$tmp/venv/bin:$$PATH" sh "$(CURDIR)/tests/first_hour.sh"
 
 # Their requirements exclude each other. CLIENT names the library whose absence is an error, not a skipped test.
-check-clients: ## Run the tests with other libraries, each of CLIENTS in a temporary environment
+# The trainings' numbers go to results/clients; `python docs/figures/make_clients.py` makes the page's tables of them.
+clients: ## Test and train with other libraries, each of CLIENTS in a temporary environment
 	@set -e; \
 	for client in $(CLIENTS); do \
 		echo "== $$client"; \
@@ -97,8 +98,11 @@ check-clients: ## Run the tests with other libraries, each of CLIENTS in a tempo
 		"$$tmp/bin/python" -m pip install -q --disable-pip-version-check -e . \
 			"torch==$(TORCH)" pytest -r "tests/clients/$$client.txt"; \
 		CLIENT=$$client "$$tmp/bin/python" -m pytest -rs tests/test_clients.py; \
+		SDL_VIDEODRIVER=dummy OMP_NUM_THREADS=1 "$$tmp/bin/python" tests/clients/run.py $$client; \
 		rm -rf "$$tmp"; \
 	done
+
+check-clients: clients # the earlier name
 
 # A tool of development (codespell) may have any licence: nothing of it is used by the package.
 REFUSED_LICENCES := GPL-2.0-only;GPL-2.0-or-later;GPL-3.0-only;GPL-3.0-or-later;GNU General Public License v2 (GPLv2);GNU General Public License v3 (GPLv3);GNU Affero General Public License v3

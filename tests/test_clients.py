@@ -1,6 +1,6 @@
 """Libraries that drive the environment: wrappers, learners, and what the page about them shows.
 
-A test is skipped where its library is missing. ``make check-clients`` installs the libraries, in an
+A test is skipped where its library is missing. ``make clients`` installs the libraries, in an
 environment for each file in tests/clients, and sets ``CLIENT`` to the file whose libraries must be there.
 """
 
@@ -8,10 +8,12 @@ from __future__ import annotations
 
 import ast
 import importlib
+import json
 import os
 import re
+import sys
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -25,6 +27,9 @@ from tlf_env.common.presets import presets_folder
 from tlf_env.task.info import INFO_KEYS
 
 ROOT = Path(__file__).resolve().parent.parent
+sys.path += [str(ROOT / "tests" / "clients"), str(ROOT / "docs" / "figures")]
+rung, wrappers = (importlib.import_module(name) for name in ("rung", "wrappers"))
+
 PAGE = (ROOT / "docs" / "compatibility.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
 
@@ -36,6 +41,7 @@ def pins(client: str) -> dict[str, str]:
     return {name.replace("-", "_"): version for name, version in lines}
 
 
+RESULT = json.loads((ROOT / "docs" / "compatibility.json").read_text(encoding="utf-8"))
 CLIENTS = {path.stem: pins(path.stem) for path in (ROOT / "tests" / "clients").glob("*.txt")}
 REQUIRED = CLIENTS[os.environ["CLIENT"]] if "CLIENT" in os.environ else {}
 
@@ -58,35 +64,32 @@ def needed(name: str) -> Any:
     return pytest.importorskip(name)
 
 
-# SuperSuit
-
-WRAPPERS: dict[str, Callable[[Any, Any], Any]] = {
-    "frame_skip": lambda supersuit, env: supersuit.frame_skip_v0(env, 3),
-    "frame_stack": lambda supersuit, env: supersuit.frame_stack_v1(env, 4),
-    "normalize_obs": lambda supersuit, env: supersuit.normalize_obs_v0(env),
-    "clip_actions": lambda supersuit, env: supersuit.clip_actions_v0(env),
-    "agent_indicator": lambda supersuit, env: supersuit.agent_indicator_v0(env, type_only=False),
-    "black_death": lambda supersuit, env: supersuit.black_death_v3(env),
-    "dtype": lambda supersuit, env: supersuit.dtype_v0(env, np.float64),
-    "delay_observations": lambda supersuit, env: supersuit.delay_observations_v0(env, 3),
-    "sticky_actions": lambda supersuit, env: supersuit.sticky_actions_v0(env, 0.3),
-}
+# Wrappers of Gymnasium and SuperSuit
 
 
-@pytest.mark.parametrize("wrapper", WRAPPERS)
-@both_ends
-def test_wrappers_of_supersuit_run_past_an_end(wrapper: str, ending: dict[str, Any]) -> None:
-    supersuit = needed("supersuit")
-    env = WRAPPERS[wrapper](supersuit, tlf_env.parallel_env("infinity", **ending))
-    env.reset(seed=0)
-    ended = 0
-    for _ in range(60):
-        env.step({agent: env.action_space(agent).sample() for agent in env.agents})
-        if not env.agents:
-            ended += 1
-            seen, _ = env.reset(seed=ended)
-            assert all(env.observation_space(agent).contains(row) for agent, row in seen.items())
-    assert ended >= 2
+@pytest.mark.parametrize(
+    ("group", "name"),
+    [(group, name) for group, kinds in wrappers.GROUPS.items() for name in kinds],
+)
+def test_a_wrapper_runs_past_two_ends(
+    group: str, name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    needed(group.partition(",")[0].lower())
+    if name == "NumpyToTorch":
+        needed("torch")
+        needed("array_api_compat")
+    if name == "ArrayConversion":
+        needed("array_api_compat")
+    if name == "RecordVideo":
+        needed("moviepy")
+    if (kind := wrappers.GROUPS[group][name]) and getattr(kind, "made", None):
+        needed("pygame")
+    if name == "ObstructView":
+        needed("cv2")
+    if not wrappers.exists(group, name) and "gymnasium" not in REQUIRED:
+        pytest.skip(f"this version of {group} has no {name}")
+    assert wrappers.outcome(group, name) == ""
 
 
 def test_a_skipped_frame_is_a_step_with_the_same_action() -> None:
@@ -141,6 +144,40 @@ def test_a_vector_environment_gives_tensors(mode: str) -> None:
     assert isinstance(seen, torch.Tensor)
     assert isinstance(rewards, torch.Tensor)
     assert ends.count(int(tlf_env.EndReason.HORIZON)) == 3
+
+
+# Minari
+
+
+def test_minari_records_what_was_driven(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    minari = needed("minari")
+    pytest.importorskip("jax")  # its collector's requirement, which `minari[create]` brings
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path))
+    made = gymnasium.make("tlf_env/Infinity-v0", infos=False, **BRIEF)
+    env = minari.DataCollector(made, data_format="arrow")  # the other format needs h5py
+    rng = np.random.default_rng(0)
+    driven: list[tuple[Any, ...]] = []
+    for seed in range(3):
+        seen = [env.reset(seed=seed)[0]]
+        actions, rewards, over = [], [], False
+        while not over:
+            actions.append(rng.uniform(-1.0, 1.0, 2).astype(np.float32))
+            row, reward, terminated, truncated, _ = env.step(actions[-1])
+            seen.append(row)
+            rewards.append(reward)
+            over = terminated or truncated
+        driven.append((seen, actions, rewards))
+    env.create_dataset("tlf/brief-v0", algorithm_name="random", eval_env="tlf_env/Infinity-v0")
+    env.close()
+    loaded = minari.load_dataset("tlf/brief-v0")
+    assert loaded.total_episodes == 3
+    for episode, (seen, actions, rewards) in zip(loaded, driven, strict=True):
+        np.testing.assert_array_equal(episode.observations, seen)
+        np.testing.assert_array_equal(episode.actions, actions)
+        np.testing.assert_array_equal(episode.rewards, rewards)
+        assert episode.truncations.tolist() == [False] * 19 + [True]
+    again = loaded.recover_environment()
+    np.testing.assert_array_equal(again.reset(seed=0)[0], driven[0][0][0])
 
 
 # TorchRL
@@ -505,7 +542,77 @@ def test_what_the_page_shows_runs(
 
 def test_the_page_has_the_versions_that_are_installed_for_the_check() -> None:
     rows = re.findall(r"^\| \[([\w-]+)\]\(\S+\) \| (\d[\w.]*) \|", PAGE, re.MULTILINE)
-    shown = {name.lower().replace("rllib", "ray"): version for name, version in rows}
-    for client in CLIENTS:
-        assert shown[client] == CLIENTS[client][client]
-    assert shown["supersuit"] == CLIENTS["torchrl"]["supersuit"]
+    shown = {
+        name.lower().replace("rllib", "ray").replace("-", "_"): version for name, version in rows
+    }
+    fixed = {name: version for pins in CLIENTS.values() for name, version in pins.items()}
+    for name, version in shown.items():
+        assert fixed.get(name, version) == version
+    assert {"supersuit", "minari", "ray", "torchrl", "tianshou"} <= set(shown) & set(fixed)
+
+
+def page_maker() -> Any:
+    """The module that writes the tables; like the other makers of pages, it imports matplotlib."""
+    pytest.importorskip("matplotlib")
+    return importlib.import_module("make_clients")
+
+
+def test_the_tables_are_those_of_the_runs() -> None:
+    make_clients = page_maker()
+    for name, made in (
+        ("trainings of clients", make_clients.trainings(RESULT)),
+        ("wrappers", make_clients.wrappers(RESULT)),
+    ):
+        assert f"<!-- {name} -->\n{made}\n<!-- end of {name} -->" in PAGE
+
+
+def test_every_training_is_of_the_fixed_version_and_acts_the_same_when_loaded() -> None:
+    assert set(RESULT) <= set(CLIENTS)
+    assert set(page_maker().ORDER) == set(CLIENTS)
+    for client, runs in RESULT.items():
+        assert runs["trainings"]
+        for run in runs["trainings"]:
+            fixed = CLIENTS[client].get(run["package"].replace("-", "_"))
+            assert run["version"] == fixed or fixed is None
+            assert run["loads"]
+
+
+def test_a_folder_of_new_runs_replaces_the_earlier_ones(tmp_path: Path) -> None:
+    make_clients = page_maker()
+    changed = {"checks": [], "trainings": []}
+    (tmp_path / "ray.json").write_text(json.dumps(changed), encoding="utf-8")
+    merged = make_clients.merged(RESULT, tmp_path)
+    assert merged == RESULT | {"ray": changed}
+    (tmp_path / "new.json").write_text("{}", encoding="utf-8")
+    with pytest.raises(ValueError, match="new: not in the order of the page"):
+        make_clients.merged(RESULT, tmp_path)
+
+
+# How a training is judged
+
+
+def test_a_return_that_stays_within_its_noise_does_not_rise() -> None:
+    assert rung.rises([1.0, 2.0, 3.0], [2.0, 3.5, 4.2])
+    assert not rung.rises([1.0, 2.0, 3.0], [5.0, 2.0, 1.0])
+    assert not rung.rises([1.0, 2.0, 3.0], [0.0, 1.0, 2.0])
+
+
+def test_the_rung_is_that_of_the_ladder() -> None:
+    own = yaml.safe_load((ROOT / "configs/train/ladder-1-point.yaml").read_text(encoding="utf-8"))
+    ladder = own["scenario"] | {"plant": own["tasks"]["infinity"]["plant"]}
+    assert {name: rung.RUNG[name] for name in ladder} == ladder
+    assert list(own["disturbances"]) == [rung.RUNG["disturbance"]]
+    scratch = yaml.safe_load((ROOT / "configs/train/scratch.yaml").read_text(encoding="utf-8"))
+    assert rung.RUNG["reward"] == scratch["scenario"]["reward"]
+
+
+def test_what_is_loaded_must_act_the_same() -> None:
+    def still(observation: np.ndarray, first: bool) -> np.ndarray:
+        return np.zeros(2)
+
+    def other(observation: np.ndarray, first: bool) -> np.ndarray:
+        return np.full(2, 1e-6)
+
+    assert rung.same_actions(still, still)
+    assert not rung.same_actions(still, other)
+    assert np.mean(rung.returns(still)) == pytest.approx(174.7, abs=0.1)

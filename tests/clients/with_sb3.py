@@ -1,0 +1,82 @@
+"""Stable-baselines3 and sb3-contrib on the first rung."""
+
+from __future__ import annotations
+
+from typing import Any, ClassVar
+
+import numpy as np
+import rung
+from sb3_contrib import TQC, CrossQ, RecurrentPPO
+from sb3_models import OFF_POLICY, ON_POLICY, OfSB3
+from stable_baselines3 import PPO, SAC, TD3
+from stable_baselines3.common.noise import NormalActionNoise
+
+
+class PPOSideBySide(OfSB3):
+    """PPO on formations side by side."""
+
+    algorithm, kind, steps, settings = "PPO", PPO, 60_000, ON_POLICY
+
+
+class PPOAlone(OfSB3):
+    """PPO with the environment of one learner."""
+
+    algorithm, kind, steps = "PPO", PPO, 20_000
+    door = "`gymnasium.make`"
+    settings: ClassVar[dict[str, Any]] = {"learning_rate": 1e-3}
+
+    def environment(self) -> Any:
+        return rung.single()
+
+
+class SACSideBySide(OfSB3):
+    """SAC on formations side by side."""
+
+    algorithm, kind, steps, settings = "SAC", SAC, 10_000, OFF_POLICY
+
+
+class TD3SideBySide(OfSB3):
+    """TD3 on formations side by side, with noise on its actions."""
+
+    algorithm, kind, steps = "TD3", TD3, 8_000
+    settings: ClassVar[dict[str, Any]] = {
+        **OFF_POLICY,
+        "action_noise": NormalActionNoise(np.zeros(2), np.full(2, 0.3)),
+    }
+
+
+class OfContrib(OfSB3):
+    """A model of sb3-contrib."""
+
+    library, package = "sb3-contrib", "sb3-contrib"
+
+
+class Recurrent(OfContrib):
+    """PPO with an LSTM."""
+
+    algorithm, kind, steps = "RecurrentPPO", RecurrentPPO, 24_000
+    policy = "MlpLstmPolicy"
+    settings: ClassVar[dict[str, Any]] = {**ON_POLICY, "n_epochs": 4}
+
+
+class TQCSideBySide(OfContrib):
+    """TQC on formations side by side."""
+
+    algorithm, kind, steps, settings = "TQC", TQC, 8_000, OFF_POLICY
+
+
+class CrossQSideBySide(OfContrib):
+    """CrossQ on formations side by side."""
+
+    algorithm, kind, steps, settings = "CrossQ", CrossQ, 8_000, OFF_POLICY
+
+
+CLIENTS = (
+    PPOSideBySide,
+    PPOAlone,
+    SACSideBySide,
+    Recurrent,
+    TQCSideBySide,
+    CrossQSideBySide,
+    TD3SideBySide,
+)
