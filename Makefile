@@ -162,7 +162,7 @@ speed: $(VENV)/.stamp-test ## Measure steps per second, compared with other envi
 	$(BIN)/tlf speed
 
 speed-docs: $(VENV)/.stamp-test ## Measure steps per second and update docs/performance.md and its figure
-	$(BIN)/tlf speed --out docs/performance.json >/dev/null
+	$(BIN)/tlf speed --memory --cold --out docs/performance.json >/dev/null
 	$(BIN)/python docs/figures/make_speed.py
 
 board: $(VENV)/.stamp-test ## Run the plan of the published leaderboard (hours, resumable) and write its pages
@@ -177,7 +177,7 @@ constraints: ## Update constraints.txt from a temporary environment with every e
 	$(PYTHON) -m venv "$$tmp/venv"; \
 	py="$$tmp/venv/bin/python"; \
 	"$$py" -m pip install -q --disable-pip-version-check "torch==$(TORCH)" \
-		build editables hatchling ".[bench,benchmarl,data,dev,docs,figures,mpc,peers,ray,train,tune,view]"; \
+		build editables hatchling ".[bench,benchmarl,data,dev,docs,figures,mpc,peers,peers-jax,ray,train,tune,view]"; \
 	"$$py" -m pip check; \
 	echo "# Versions of everything that the extras install. Made by: make constraints" > "$$tmp/new"; \
 	"$$py" -m pip freeze --all --exclude pip --exclude tlf-env > "$$tmp/frozen"; \
