@@ -24,7 +24,7 @@ BodyMass = Annotated[Positive, Field(ge=1e-6, le=1e6)]  # kg
 Inertia = Annotated[Positive, Field(ge=1e-6, le=1e15)]  # kg·mm²
 Speed = Annotated[Positive, Field(ge=1e-6, le=1e6)]  # mm/s
 Acceleration = Annotated[Positive, Field(ge=1e-3, le=1e7)]  # mm/s²
-Coefficient = Annotated[NonNegative, Field(le=1e3)]
+Coefficient = Annotated[NonNegative, Field(le=1e6)]  # so large a friction means that nothing slides
 TorqueLimit = Annotated[Positive, Field(ge=1e-6, le=1e9)]  # N·mm
 Preload = Annotated[NonNegative, Field(le=1e9)]  # N·mm
 
