@@ -130,7 +130,7 @@ def test_the_models_are_those_of_the_json_schema():
             "mm",
             "null",
         ),
-        ("Tyre", "mu_static", "number 0 to 1000", "1", "0.073"),
+        ("Tyre", "mu_static", "number 0 to 1e6", "1", "0.073"),
         ("Joints", "pin_radius_mm", "number 0 to 1e6", "mm", "8 / 3.025 / 2.5"),
         ("Wheel loop", "gain_Nmm_s", "number > 0", "N·mm/(rad/s)", "150"),
         ("Wheel loop", "speed_observer_rad_s", "number > 0, ≤ 10000, or null", "rad/s", "null"),
