@@ -497,7 +497,7 @@ def test_what_the_page_shows_runs(monkeypatch: pytest.MonkeyPatch) -> None:
         ("wheel_loop", "Proportional"),
         ("observer", "Follow"),
     ):
-        env = tlf_env.parallel_env("infinity", **{role: f"my_policies:{name}"})
+        env = tlf_env.parallel_env("infinity", trust=True, **{role: f"my_policies:{name}"})
         assert np.isfinite(drive(env, 0.2)).all()
     for robots in re.findall(r"^```yaml\n(.*?)^```", page, re.DOTALL | re.MULTILINE):
         env = tlf_env.parallel_env("infinity", **yaml.safe_load(robots))

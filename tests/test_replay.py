@@ -149,7 +149,13 @@ def test_a_page_has_the_world():
 
 
 def test_an_aborted_run_has_a_page_of_what_was_simulated(tmp_path, monkeypatch):
-    record = run_policy(load_scenario("infinity", horizon_s=4.0), Aborted(), 0, name="aborted")
+    record = run_policy(
+        load_scenario("infinity", horizon_s=4.0),
+        Aborted(),
+        0,
+        name="aborted",
+        keep_interrupted=True,
+    )
     source = write_replay(record, tmp_path / "replay.html").read_text(encoding="utf-8")
     assert held(source)["runs"][0]["rows"] == 51
     assert "interrupted after 1 s of 4 s" in source

@@ -25,7 +25,7 @@ from tlf_env.engine.arrays import FROM_SCENARIO, Arrays, Variants
 from tlf_env.engine.layout import BY_NAME, in_array
 from tlf_env.numerics.compiled import simulation_digest
 from tlf_env.onboard.memory import packed, unpacked
-from tlf_env.physics.parameters import Mass
+from tlf_env.physics.vehicle import Mass
 from tlf_env.task.info import EndReason, TouchedBy
 from tlf_env.task.scenario import Scenario
 
