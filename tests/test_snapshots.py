@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import errno
 import hashlib
 import json
 import os
@@ -1269,10 +1270,11 @@ def file(tmp_path) -> Path:
 
 
 def test_a_file_appears_complete_or_not_at_all(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        Path, "replace", lambda self, other: (_ for _ in ()).throw(OSError(28, "No space"))
-    )
-    with pytest.raises(ValueError, match=r"^cannot write \S+/moment: No space$"):
+    def full(handle):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+
+    monkeypatch.setattr(os, "fsync", full)
+    with pytest.raises(ValueError, match=r"^cannot write \S+/moment: No space"):
         moment().save(tmp_path / "moment")
     assert not list(tmp_path.iterdir())
 

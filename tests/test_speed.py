@@ -25,7 +25,7 @@ from baselines.speed.peers import (
     pythons_of,
 )
 from baselines.speed.worker import PeerError, Worker
-from tlf_env import BatchPlant, load_scenario
+from tlf_env import BatchPlant
 from tlf_env.common.presets import read_preset_or_file, yaml_text
 from tlf_env.engine.arrays import make_arrays, padded
 from tlf_env.engine.formation import reference_table
@@ -84,9 +84,13 @@ def test_special_scenarios_are_timed_beside_the_usual_one(monkeypatch):
     if MPE2 in timed:
         compared = {row["env"] for row in found["ratios"] if row["to"] == MPE2}
         assert compared == {ALONE, VECTOR, *environments.SPECIAL}
-    usual = load_scenario("infinity").disturbance
+    usual = BatchPlant("infinity", 1)
     for fields in environments.SPECIAL.values():
-        assert load_scenario("infinity", **fields).disturbance != usual
+        special = BatchPlant("infinity", 1, **fields)
+        assert (special.scenario.disturbance, special.precision) != (
+            usual.scenario.disturbance,
+            usual.precision,
+        )
 
 
 @pytest.mark.parametrize(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import importlib.util
 import sys
 from pathlib import Path
@@ -190,7 +191,8 @@ def test_a_command_imports_nothing_without_the_flag(name, folder, monkeypatch, c
     task_file(folder, estimator="nasty:never")
     plan = {"policies": ["nasty:never"], "tasks": ["infinity"], "disturbances": ["nominal"]}
     (folder / "plan.yaml").write_text(yaml.safe_dump(plan))
-    monkeypatch.setattr("baselines.commands.live.compile_before_first_run", lambda: None)
+    live = importlib.import_module("baselines.commands.live")
+    monkeypatch.setattr(live, "compile_before_first_run", lambda: None)
     monkeypatch.setattr(sys, "argv", ["tlf", *COMMANDS[name].split()])
     with pytest.raises(SystemExit) as left:
         cli.main()
