@@ -16,6 +16,7 @@ import sys
 import time
 from collections.abc import Callable, Iterable
 from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
 from typing import Any, TextIO
 
 # Steps so many times and returns the seconds; its attribute `compile_s`, if it has one, is the processor
@@ -47,10 +48,10 @@ def processor_s() -> float:
 def memory_bytes(field: str) -> int | None:
     """A field of the system's report on this process, for example VmRSS or VmHWM; None if there is none."""
     try:
-        with open("/proc/self/status", encoding="ascii") as file:  # noqa: PTH123
-            lines = [line for line in file if line.startswith(f"{field}:")]
+        report = Path("/proc/self/status").read_text(encoding="ascii")
     except OSError:
         return None
+    lines = [line for line in report.splitlines() if line.startswith(f"{field}:")]
     return int(lines[0].split()[1]) * 1024 if lines else None
 
 
@@ -59,8 +60,7 @@ def forget_peak() -> None:
     gc.collect()
     try:
         ctypes.CDLL(None).malloc_trim(0)  # of glibc
-        with open("/proc/self/clear_refs", "w", encoding="ascii") as file:  # noqa: PTH123
-            file.write("5")
+        Path("/proc/self/clear_refs").write_text("5", encoding="ascii")
     except (OSError, AttributeError):
         pass
 

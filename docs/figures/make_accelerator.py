@@ -45,7 +45,7 @@ def use_device() -> None:
     compiled.driver = lambda function: function
     of_processor = numba.extending.intrinsic
     numba.extending.intrinsic = extending.intrinsic
-    from tlf_env.numerics import angles, memory, trig  # noqa: F401 (`like` for the device)
+    from tlf_env.numerics import angles, memory, trig  # noqa: F401 - here, so that `like` is the device's
 
     numba.extending.intrinsic = of_processor  # no kernel uses those of the other modules
     from tlf_env.engine import sensors

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import functools
 from typing import Any, NamedTuple
+from unittest.mock import patch
 
 import numpy as np
 import yaml
@@ -40,11 +41,10 @@ def cell(task: str, disturbance: str, horizon_s: float) -> Cell:
     fitted = fit_policy(SYSTEM, scenario)
     scores, lost = {}, {}
     for precision in PRECISIONS:
-        run.BatchPlant = functools.partial(BatchPlant, precision=precision)  # type: ignore[misc, assignment]
-        metrics = [
-            record.metrics() for record in run.run_seeds(fitted.scenario, fitted.policy, SEEDS)
-        ]
-        run.BatchPlant = BatchPlant  # type: ignore[misc]
+        made = functools.partial(BatchPlant, precision=precision)
+        with patch.object(run, "BatchPlant", made):
+            records = list(run.run_seeds(fitted.scenario, fitted.policy, SEEDS))
+        metrics = [record.metrics() for record in records]
         errors = [max(robot.position_rmse_mm for robot in one) for one in metrics]
         lost[precision] = np.array([failed(one) for one in metrics])
         scores[precision] = np.array(errors)

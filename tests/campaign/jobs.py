@@ -118,7 +118,7 @@ def _train_result(folder: Path) -> dict[str, Any]:
         elif name.endswith(CHECKPOINT):
             with safe_open(folder / name, "np") as file:
                 state = json.loads(file.metadata()["state"])
-                found[name] = {key: file.get_tensor(key).tobytes() for key in file.keys()}  # noqa: SIM118
+                found[name] = {key: file.get_tensor(key).tobytes() for key in file.keys()}  # noqa: SIM118 - as below
             found[f"{name}, state"] = _without_times(state)
         elif name.endswith("curve.json"):
             found[name] = _without_times(json.loads(content))
