@@ -7,8 +7,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from stress_cases import Case, draw_actions, draw_case, draw_patch, rng_of, throw
-from stress_laws import Inputs, Owed, Payload, Robot, Work, audit_all, robot_row
-from stress_runs import ALLOWED, CONVERGED_MM_S, PAYLOAD, TOLERANCES, Finding, Tally
+from stress_laws import STILL_MM_S, Inputs, Owed, Payload, Robot, Work, audit_all, robot_row
+from stress_runs import ALLOWED, PAYLOAD, TOLERANCES, Finding, Tally
 
 from tlf_env.engine.formation import Formation
 from tlf_env.physics.state import Contact, Floor, Motion
@@ -153,8 +153,8 @@ def audited(
     )
     owed = Owed(*owes)
     residual = np.maximum(owed.slip, owed.turn)
-    open_gain = np.where(residual > CONVERGED_MM_S, owed.gain, 0.0)
-    owed.gain[residual > CONVERGED_MM_S] = 0.0
+    open_gain = np.where(residual > STILL_MM_S, owed.gain, 0.0)
+    owed.gain[residual > STILL_MM_S] = 0.0
     names = [*TOLERANCES, "gain not converged", "residual mm/s"]
     allowed = dict(zip(names, ALLOWED.tolist(), strict=True)) | (PIVOT if chipmunk else {})
     nothing = np.zeros(number)  # the motors are audited on the plant `batch`

@@ -34,12 +34,13 @@ from tlf_env.physics.state import Contact, Motion
 ROUNDING = float(np.finfo(float).eps)
 SOME_ROUNDINGS = 64 * ROUNDING  # of a friction limit
 SHARE_ROUNDING = 1e-10  # of the largest friction limit of a robot
-STILL_MM_S = 1e-9  # sweeps end when no velocity changes by more
+STILL_MM_S = 1e-8  # slower slip counts as none: sweeps end at changes of a tenth of it
 STICKS = 1.0 - 1e-9  # of the circle: an impulse below sticks
 KNOWN = (
     SOME_ROUNDINGS / 1e-9
 )  # of its largest value: a smaller limit is not known well enough for that
 TINY = 1e-300
+UNSEEN = 1e-160  # an impulse's square is 0 below it, so that it is inside of every circle
 SMALLEST = 1e-280  # a sum of terms above the numbers that are kept with fewer digits
 
 
@@ -310,7 +311,7 @@ def beyond(much: float, most: float, static: float) -> float:
 
     The limit is a difference of rounded numbers, and the share of a tyre may be the root of one.
     """
-    if much <= most + SHARE_ROUNDING * static:
+    if much <= most + SHARE_ROUNDING * static + UNSEEN:
         return 0.0
     return much / most - 1.0 if most > 0.0 else math.inf
 

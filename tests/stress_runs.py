@@ -8,7 +8,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from stress_cases import Case, draw_actions, draw_case, rng_of, throw
-from stress_laws import Inputs, Owed, Payload, Work, audit_all, finite, inputs_all, robot_row
+from stress_laws import (
+    STILL_MM_S,
+    Inputs,
+    Owed,
+    Payload,
+    Work,
+    audit_all,
+    finite,
+    inputs_all,
+    robot_row,
+)
 
 from tlf_env import BatchPlant
 from tlf_env.common.presets import preset_names
@@ -49,7 +59,6 @@ TOLERANCES = {
     "motors": 1e-9,
     "finite": 0.0,
 }
-CONVERGED_MM_S = 1e-8  # with a larger residual of the slip, what friction adds is only counted
 
 body_of, motion_of, contact_of, floor_of, push_of = (
     row_reader(row, 0) for row in (Body, Motion, Contact, Floor, Push)
@@ -315,9 +324,10 @@ class Audit:
         )  # fmt: skip
         owed = Owed(*self.owed)
         residual = np.maximum(owed.slip, owed.turn)
-        open_gain = np.where(residual > CONVERGED_MM_S, owed.gain, 0.0)
+        # Where the sweeps have not converged, what friction adds is only counted.
+        open_gain = np.where(residual > STILL_MM_S, owed.gain, 0.0)
         self.tally.count("gains not converged", (open_gain > TOLERANCES["gain"]).sum())
-        owed.gain[residual > CONVERGED_MM_S] = 0.0
+        owed.gain[residual > STILL_MM_S] = 0.0
         names = [*TOLERANCES, "gain not converged", "residual mm/s"]
         laws = [self.motors if law == "motors" else getattr(owed, law) for law in TOLERANCES]
         sizes = np.array([*laws, open_gain, residual])
