@@ -446,6 +446,37 @@ def test_python_can_call_what_is_compiled_for_compiled_code(cache):
         swapped("text", 1.0)
 
 
+@compiled.law
+def twice_swapped(pair: Pair) -> Pair:
+    return swapped(swapped(pair, 2.0), 4.0)
+
+
+def test_compiled_code_of_others_calls_laws_that_call_laws(cache):
+    """What a law calls is linked into a driver once; Numba's own compilation gets it with the law."""
+
+    def called(a: np.ndarray) -> float:
+        doubled(a)
+        return twice_swapped(Pair(a[0], 3.0)).first + swapped(Pair(5.0, 3.0), 1.0).second
+
+    expected = 2.0 / 4.0 + 5.0
+    for compiling in (numba.njit, compiled.driver, numba.njit):
+        assert compiling(called)(np.ones(2)) == expected
+    assert twice_swapped(Pair(2.0, 3.0)) == (2.0 / 4.0, 3.0 / 2.0)
+
+
+def test_compiling_leaves_numba_as_it_was(cache):
+    asks, level = numba.types.Function.get_call_type, numba.config.OPT
+
+    def wrong(a: float) -> float:
+        return a + "text"
+
+    with pytest.raises(numba.TypingError):
+        compiled.driver(wrong)(1.0)
+    assert compiled.driver(abs_of)(-1.0) == 1.0
+    assert numba.types.Function.get_call_type is asks
+    assert numba.config.OPT is level
+
+
 def test_a_driver_is_compiled_without_being_called(cache):
     def driven(a: np.ndarray) -> None:
         doubled(a)

@@ -40,18 +40,21 @@ from numba.core.cgutils import create_struct_proxy
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder
 from numba.core.compiler_lock import global_compiler_lock
-from numba.core.compiler_machinery import PassManager, register_pass
+from numba.core.compiler_machinery import CompilerPass, PassManager, register_pass
 from numba.core.registry import CPUDispatcher
+from numba.core.sigutils import normalize_signature
 from numba.core.typed_passes import NativeLowering, NopythonRewrites
 from numba.core.types.misc import unliteral
 from numba.core.typing.typeof import Purpose, typeof_impl
 from numba.core.untyped_passes import (
+    DeadBranchPrune,
     FindLiterallyCalls,
     InlineClosureLikes,
     LiteralPropagationSubPipelinePass,
     LiteralUnroll,
     MakeFunctionToJitFunction,
     RewriteDynamicRaises,
+    RewriteSemanticConstants,
     WithLifting,
 )
 from numba.extending import intrinsic
@@ -318,17 +321,76 @@ class _Cache(FunctionCache):
 class _LinkedLibrary(JITCodeLibrary):
     """Code of a function that is only linked into its callers.
 
-    Numba optimises every function and makes machine code of it, also where nothing but compiled code calls
-    it. Here both are done once, for the driver that all its functions are linked into.
+    Numba links into every function all that it calls, optimises it, and makes machine code of it, also where
+    nothing but compiled code calls it. Here this is done once, for the driver: see :class:`_DriverLibrary`.
     """
 
-    def _optimize_final_module(self) -> None:
-        """Nothing: the driver is optimised as a whole."""
+    _shared_module: Any
 
-    def _finalize_final_module(self) -> None:
+    def finalize(self) -> None:
+        """Nothing more is added; nothing is linked."""
+        self._raise_if_finalized()
+        for function in self._final_module.functions:
+            if not function.is_declaration:
+                function.linkage = "linkonce_odr"
         self._finalize_dynamic_globals()
-        self._verify_declare_only_symbols()
         self._finalized = True
+
+    def alone(self) -> Any:
+        """The module of this function without those that it calls."""
+        self._ensure_finalized()
+        return self._final_module
+
+    def _get_module_for_linking(self) -> Any:
+        """With all that it calls, for a function that Numba compiles in its own way."""
+        if self._shared_module is None:
+            module = self.alone().clone()
+            for library in _all_called(self._linking_libraries):
+                module.link_in(_module_of(library), preserve=True)
+            self._shared_module = module
+        return self._shared_module
+
+
+class _DriverLibrary(JITCodeLibrary):
+    """Code of a driver: all that it calls, directly or not, is linked into it once."""
+
+    def finalize(self) -> None:
+        """Link, optimise, and make machine code."""
+        self._raise_if_finalized()
+        for library in _all_called(self._linking_libraries):
+            self._reload_init.update(library._reload_init)
+            self._final_module.link_in(_module_of(library), preserve=True)
+        self._linking_libraries.clear()
+        super().finalize()
+
+
+def _all_called(libraries: list[Any]) -> list[Any]:
+    """Libraries, and those that they call, each once."""
+    found: dict[Any, None] = {}  # an ordered set
+    left = list(reversed(libraries))
+    while left:
+        library = left.pop()
+        if library not in found:
+            found[library] = None
+            if isinstance(library, _LinkedLibrary):
+                left += reversed(library._linking_libraries)
+    return list(found)
+
+
+def _module_of(library: Any) -> Any:
+    if isinstance(library, _LinkedLibrary):
+        return library.alone()
+    return library._get_module_for_linking()
+
+
+@register_pass(mutates_CFG=True, analysis_only=False)
+class _DriverLowering(NativeLowering):
+    _name = "driver_lowering"
+
+    def run_pass(self, state: Any) -> bool:
+        state.library = _DriverLibrary(state.targetctx.codegen(), state.func_id.func_qualname)
+        state.library.enable_object_caching()
+        return bool(super().run_pass(state))
 
 
 @register_pass(mutates_CFG=True, analysis_only=False)
@@ -345,8 +407,10 @@ class _LinkedLowering(NativeLowering):
         return True
 
 
-# Passes over what no law has: closures, contexts, raised errors, loops over tuples, arithmetic of arrays.
+# Passes over what no law has: closures, contexts, raised errors, loops over tuples, arithmetic of arrays, and
+# arguments that are left out, for which there would be branches.
 NOT_IN_LAWS = (
+    DeadBranchPrune,
     FindLiterallyCalls,
     InlineClosureLikes,
     LiteralPropagationSubPipelinePass,
@@ -354,38 +418,66 @@ NOT_IN_LAWS = (
     MakeFunctionToJitFunction,
     NopythonRewrites,
     RewriteDynamicRaises,
+    RewriteSemanticConstants,
     WithLifting,
 )
 
 
 class _LinkedCompiler(CompilerBase):
+    lowering: type[NativeLowering] = _LinkedLowering
+    without: tuple[type[CompilerPass], ...] = NOT_IN_LAWS
+
     def define_pipelines(self) -> list[PassManager]:
         manager = DefaultPassBuilder.define_nopython_pipeline(self.state)
         manager.passes = [
-            (_LinkedLowering if one is NativeLowering else one, what)
+            (self.lowering if one is NativeLowering else one, what)
             for one, what in manager.passes
-            if one not in NOT_IN_LAWS
+            if one not in self.without
         ]
         manager.finalize()
         return [manager]
+
+
+class _DriverCompiler(_LinkedCompiler):
+    lowering = _DriverLowering
+    without = ()
 
 
 @contextmanager
 def _quickly() -> Iterator[None]:
     """Look less often for garbage: Numba holds millions of objects, and next to none is garbage.
 
-    And leave out the passes of LLVM that gain nothing here.
+    And leave out the passes of LLVM that gain nothing here, and remember what operators return.
     """
     config: Any = numba.config
+    functions: Any = types.Function
     with global_compiler_lock:  # so that no other thread restores what is set here
-        threshold, level = gc.get_threshold(), config.OPT
+        threshold, level, ask = gc.get_threshold(), config.OPT, functions.get_call_type
         gc.set_threshold(*FEW)
         config.OPT = type(level)(min(level, LEVEL))
+        functions.get_call_type = _remembering(ask)
         try:
             yield
         finally:
+            functions.get_call_type = ask
             config.OPT = level
             gc.set_threshold(*threshold)
+
+
+def _remembering(ask: Callable[..., Any]) -> Callable[..., Any]:
+    """Numba's ``get_call_type`` of operators and functions of the library, asked once for the same types.
+
+    For each operator of each law Numba tries a dozen possibilities, and writes down why each does not fit.
+    """
+    known: dict[Any, Any] = {}
+
+    def get_call_type(function: types.Function, context: Any, args: Any, kws: Any) -> Any:
+        call = (function, tuple(args), tuple(kws.items()))
+        if call not in known:
+            known[call] = ask(function, context, args, kws)
+        return known[call]
+
+    return get_call_type
 
 
 class _Driver(CPUDispatcher):
@@ -450,6 +542,16 @@ class _Inner(CPUDispatcher):
         given, single = tuple(unliteral(one) for one in args), self.is_single(args)
         with _constants.precision(single):
             return CPUDispatcher.get_call_template(self._of(single), given, plain)
+
+    def compile(self, sig: Any) -> Any:
+        """As Numba does, without the clocks that it runs for each function and stops at every call of LLVM."""
+        args, return_type = normalize_signature(sig)
+        found = self.overloads.get(tuple(args))
+        if found is None:
+            with global_compiler_lock, self._compiling_counter:
+                found = self._compiler.compile(args, return_type)
+                self.add_overload(found)
+        return found.entry_point
 
     def get_overload(self, sig: Any) -> Any:
         """What a call with these types is linked to."""
@@ -546,7 +648,7 @@ def driver(function: F) -> F:
     if numba.config.DISABLE_JIT:
         return function
     options = {"nopython": True, "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    dispatcher: Any = _Driver(function, targetoptions=options)
+    dispatcher: Any = _Driver(function, targetoptions=options, pipeline_class=_DriverCompiler)
     dispatcher._cache = _NothingKept() if cache_folder() is None else _Cache(function)
     compiled: F = dispatcher
     return compiled
