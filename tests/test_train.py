@@ -110,6 +110,7 @@ def test_shipped_configs_are_valid(path: Path):
         ({"levels": [1.0, 0.5], "curriculum": {}}, "that increase, got levels [1.0, 0.5]"),
         ({"curriculum": {"failed_share": 1.0}}, "failed_share: Input should be less than 1"),
         ({"algorithm": "SAC", "imitation": {}}, "imitation needs algorithm PPO, got SAC"),
+        ({"precision": "half"}, "precision: Input should be 'double' or 'single'"),
     ],
 )
 def test_a_wrong_config_is_reported_in_one_line(changes: dict, said: str):
@@ -245,6 +246,19 @@ class TestTraining:
         before_the_tanh = drawn if algorithm == "PPO" else np.arctanh(drawn)
         np.testing.assert_allclose(before_the_tanh.mean(axis=0), 0.0, atol=0.03)
         np.testing.assert_allclose(np.log(before_the_tanh.std(axis=0)), -1.2, atol=0.03)
+
+    def test_episodes_are_run_in_the_precision_of_the_configuration(self, tmp_path):
+        from baselines.training.model import make_envs
+        from baselines.training.train import train
+
+        curves = {}
+        for precision in ("double", "single"):
+            config = load_config({**CONFIG, "precision": precision})
+            assert {plant.precision for plant in make_envs(config, 1).plants} == {precision}
+            curves[precision] = train(config, 3, tmp_path / precision)["evaluations"]
+        first, later = ([curves[one][i] for one in curves] for i in (0, -1))
+        assert first[0] == first[1], "the policy before the training, evaluated in double precision"
+        assert later[0] != later[1]
 
     def test_a_killed_training_continues_from_its_last_checkpoint(self, tmp_path):
         from baselines.training.train import POLICY_FILE, train

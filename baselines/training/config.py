@@ -184,6 +184,7 @@ class TrainConfig(Frozen):
     # Control steps × robots, over all formations; offline those drawn from the data, updates × batch_size.
     robot_steps: Count
     formations: Count = 96
+    precision: Literal["double", "single"] = "double"  # of episodes; evaluations are in double
     seeds: SeedsFromTo = TRAINING_SEEDS  # of the episodes
     scenario: dict[str, Any] = {}  # scenario fields of every task
     tasks: Annotated[

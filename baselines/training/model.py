@@ -37,7 +37,12 @@ def make_envs(config: TrainConfig, threads: int) -> FormationVecEnv:
     tasks, shares = config.mixture()
     history = config.network.history
     formations = config.formations if config.offline is None else len(tasks)
-    given: dict[str, Any] = {"mixture": shares, "threads": threads, "infos": False}
+    given: dict[str, Any] = {
+        "mixture": shares,
+        "threads": threads,
+        "precision": config.precision,
+        "infos": False,
+    }
     with without_warnings():
         if history is None:
             envs = FormationVecEnv(tasks, formations, **given)
