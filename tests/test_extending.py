@@ -79,8 +79,8 @@ def test_a_quantity_on_board_takes_edits_in_two_files():
     """A row in the layout; its place in a tile and its law."""
     assert [Path(edit.path).name for edit in of("A quantity on board")] == [
         "layout.py",
-        "tiles.py",
-        "tiles.py",
+        "tile_sensing.py",
+        "tile_sensing.py",
     ]
 
 

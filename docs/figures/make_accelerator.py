@@ -58,7 +58,7 @@ def use_device() -> None:
 
 def kernels() -> dict[str, tuple[Callable[..., None], Any]]:
     """The kernels by name, with their types; row r of robot i is ``robots[r, i]``, as in a tile."""
-    from tlf_env.engine import tiles
+    from tlf_env.engine import tile_rows as rows
     from tlf_env.engine.layout import Draw, Reading, WheelPair, YawRate
     from tlf_env.engine.sensors import (
         account_robot,
@@ -71,16 +71,16 @@ def kernels() -> dict[str, tuple[Callable[..., None], Any]]:
     from tlf_env.onboard.kinds import EKF_SLIP
     from tlf_env.physics.vehicle import Push, advance_pose, roll, slide
 
-    body_of, order_of, effects_of = tiles.body_of, tiles.order_of, tiles.effects_of
-    loop_of, belief_of, ekf_of = tiles.loop_of, tiles.belief_of, tiles.ekf_of
-    slip_ekf_of, traction_of, push_of = tiles.slip_ekf_of, tiles.traction_of, tiles.push_of
-    motion_of, set_motion = tiles.motion_of, tiles.set_motion
-    contact_of, set_contact = tiles.contact_of, tiles.set_contact
-    held_of, set_held = tiles.held_of, tiles.set_held
-    sensors_of, set_sensors = tiles.sensors_of, tiles.set_sensors
-    estimate_of, set_estimate = tiles.estimate_of, tiles.set_estimate
-    slip_of, set_slip = tiles.slip_of, tiles.set_slip
-    trace_of, set_trace = tiles.trace_of, tiles.set_trace
+    body_of, order_of, effects_of = rows.body_of, rows.order_of, rows.effects_of
+    loop_of, belief_of, ekf_of = rows.loop_of, rows.belief_of, rows.ekf_of
+    slip_ekf_of, traction_of, push_of = rows.slip_ekf_of, rows.traction_of, rows.push_of
+    motion_of, set_motion = rows.motion_of, rows.set_motion
+    contact_of, set_contact = rows.contact_of, rows.set_contact
+    held_of, set_held = rows.held_of, rows.set_held
+    sensors_of, set_sensors = rows.sensors_of, rows.set_sensors
+    estimate_of, set_estimate = rows.estimate_of, rows.set_estimate
+    slip_of, set_slip = rows.slip_of, rows.set_slip
+    trace_of, set_trace = rows.trace_of, rows.set_trace
 
     def plant(law: Any) -> Callable[[Any, float], None]:
         """A substep of the plant by one of its two laws."""
