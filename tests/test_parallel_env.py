@@ -18,6 +18,7 @@ from scipy import stats
 import tlf_env
 from tlf_env import EndReason
 from tlf_env.disturbances.channels import CHANNELS
+from tlf_env.task.info import INFO_KEYS as ALL_KEYS
 from tlf_env.task.observation import TRACKING_ENTRIES, Tracking
 from tlf_env.task.reward import RewardTerms
 from tlf_env.task.trajectories import sample
@@ -607,6 +608,39 @@ def test_an_episode_can_be_left_and_started_anew():
 
 
 # Reward and info
+
+
+@pytest.mark.parametrize(
+    "infos",
+    [
+        False,
+        ("end", "reward_fine", "slip_delta_1_mm_s", "time_gap_error_s"),
+        ("slip_delta_2_rad_s", "slip_delta_1_mm_s"),
+        ALL_KEYS[::-1],
+    ],
+)
+def test_infos_may_be_chosen(infos):
+    """Their keys come in the order of the choice, with the same values, and a changed info changes no other."""
+    envs = [
+        tlf_env.parallel_env("infinity", infos=one, disturbance="slip-noise")
+        for one in (infos, True)
+    ]
+    results = [[env.reset(seed=3)[-1] for env in envs]]
+    for _ in range(30):
+        actions = {agent: np.array([0.5, -0.5]) for agent in envs[0].agents}
+        results.append([env.step(actions)[-1] for env in envs])
+        for info in results[-1][0].values():
+            for key, value in list(info.items()):
+                info[key] = None
+                info[f"_{key}"] = value
+    assert (
+        len({one["robot_1"].get("_slip_delta_1_mm_s") for one, _ in results[1:]}) > 1 or not infos
+    )
+    for mine, theirs in results:
+        for agent, info in mine.items():
+            values = [info.get(f"_{key}", info.get(key)) for key in infos or ()]
+            assert list(info)[: len(values)] == list(infos or ())
+            np.testing.assert_array_equal(values, [theirs[agent][key] for key in infos or ()])
 
 
 def test_info_has_its_keys():

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -97,7 +97,12 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                 raise ValueError(f"adversary {adversary!r} must be callable with the environment")
             overrides["adversary"] = True
         self._info_keys = chosen_keys(infos)
-        self._pick = [INFO_KEYS.index(key) for key in self._info_keys]
+        channels = {channel.key: i for i, channel in enumerate(CHANNELS)}
+        # Where some infos are chosen: their channels, and their places among what is read with these.
+        chosen = sorted(channels[key] for key in self._info_keys if key in channels)
+        self._chosen = np.array(chosen, dtype=np.intp)
+        read = [key for key in INFO_KEYS if key not in channels or key in self._info_keys]
+        self._pick = [(key, read.index(key)) for key in self._info_keys]
         self._scenario = load_scenario(scenario, **overrides)
         warn_of([self.scenario])
         self.metadata: dict[str, Any] = {
@@ -398,10 +403,14 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return dict(zip(self.possible_agents, fresh, strict=True))
 
     def _infos(self, *, afresh: bool = False) -> dict[Agent, dict[str, Any]]:
-        keys, pick, arrays = self._info_keys, self._pick, self._formation.arrays
+        keys, arrays = self._info_keys, self._formation.arrays
         if not keys:
             return {agent: {} for agent in self.possible_agents}
-        if self._formation.step_count and not afresh and len(keys) == len(INFO_KEYS):
+        if keys != INFO_KEYS:
+            some = info_rows(arrays, channels=self._chosen)
+            chosen = [{key: row[place] for key, place in self._pick} for row in some]
+            return dict(zip(self.possible_agents, chosen, strict=True))
+        if self._formation.step_count and not afresh:
             changed = info_rows(arrays, channels=self._varying)
             named = {}
             for agent, first, row in zip(
@@ -410,10 +419,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
                 named[agent] = info = first.copy()
                 info.update(zip(self._varying_keys, row, strict=True))
             return named
-        rows: Sequence[Sequence[float]] = info_rows(arrays)
-        if len(keys) < len(INFO_KEYS):
-            rows = [[row[i] for i in pick] for row in rows]
-        self._first_infos = [dict(zip(keys, row, strict=True)) for row in rows]
+        self._first_infos = [dict(zip(keys, row, strict=True)) for row in info_rows(arrays)]
         copies = [info.copy() for info in self._first_infos]
         return dict(zip(self.possible_agents, copies, strict=True))
 
