@@ -44,7 +44,12 @@ def use_device() -> None:
     compiled.law_in_double = compiled.by_number = on_device
     compiled.driver = lambda function: function
     of_processor = numba.extending.intrinsic
-    numba.extending.intrinsic = extending.intrinsic
+
+    def intrinsic(*function: Any, **options: Any) -> Any:
+        """Of the device, but tables, which want literals: no kernel has them."""
+        return of_processor(**options) if options else extending.intrinsic(*function)
+
+    numba.extending.intrinsic = intrinsic
     from tlf_env.numerics import angles, memory, trig  # noqa: F401 - here, so that `like` is the device's
 
     numba.extending.intrinsic = of_processor  # no kernel uses those of the other modules
