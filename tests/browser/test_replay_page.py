@@ -244,7 +244,9 @@ def test_a_name_stays_text(records, tmp_path, at, complaints):
 
 
 def test_an_aborted_run_is_replayed_to_its_end(tmp_path, at, complaints):
-    record = run_policy(load_scenario("infinity"), Aborted(), 0, name="aborted")
+    record = run_policy(
+        load_scenario("infinity"), Aborted(), 0, name="aborted", keep_interrupted=True
+    )
     page = at(write_replay(record, tmp_path / "replay.html"), 60.0)
     assert state(page, "t") == pytest.approx(1.0)
     assert "interrupted after 1 s of" in page.find_element("css selector", "header").text
