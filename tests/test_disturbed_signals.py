@@ -6,14 +6,14 @@ import numpy as np
 import pytest
 from disturbance_helpers import ANGLES, SHOWS, SLIPPING, Run, constant, make, run, tree
 
-from tlf_env.disturbances.channels import (
-    NOMINAL_NOISE_MM,
-)
+from tlf_env.disturbances.channels import DEAD_TIME, NOMINAL_NOISE_MM
+from tlf_env.engine.arrays import longest
 from tlf_env.engine.radio import delayed_message
 from tlf_env.engine.settings import make_settings
 from tlf_env.onboard.parts import part_name
 from tlf_env.physics.state import Motion
 from tlf_env.task.observation import SENSOR_TAIL_ENTRIES
+from tlf_env.task.scenario import load_scenario
 
 # --- sensors ---------------------------------------------------------------------------------------
 
@@ -97,6 +97,49 @@ def test_dead_time_delays_the_torque_by_exactly_so_many_milliseconds(millisecond
     given = torques(asked, {"actuator.dead_time_s": milliseconds / 1000})
     assert given[:milliseconds] == pytest.approx(0.0)
     assert given[milliseconds:] == pytest.approx(asked[: 200 - milliseconds], abs=1e-9)
+
+
+def test_a_dead_time_that_walks_away_from_its_start_delays_by_what_it_is():
+    """It has no bound but the channel's range, so the memory of torques must be as long as that."""
+    walk = {"type": "random_walk", "start": 0.03, "per_sqrt_s": 0.2}
+    asked = asked_at_random(400)
+    found = run(
+        {"actuator.dead_time_s": walk},
+        seconds=0.4,
+        action="torque",
+        control_period_s=0.001,
+        horizon_s=2.0,
+        actions=lambda k: asked[k] / 15.0,
+    )
+    dead = np.rint(found.applied[:, :, DEAD_TIME] * 1000).astype(int)
+    assert dead.max() > 60
+    assert dead.min() < 10
+    given = np.stack([found.of_info("torque_l_Nmm"), found.of_info("torque_r_Nmm")], axis=-1)
+    then = np.arange(400)[:, None] - dead
+    wanted = np.where((then >= 0)[:, :, None], asked[then.clip(0), np.arange(3)], 0.0)
+    assert given == pytest.approx(wanted, abs=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("signal", "most"),
+    [
+        (0.03, 0.03),
+        ({"type": "uniform", "low": 0.01, "high": 0.04}, 0.04),
+        ({"type": "sine", "amplitude": 0.01, "mean": 0.02, "frequency_hz": 1.0}, 0.03),
+        ({"type": "gaussian", "mean": 0.03, "std": 0.0}, 0.03),
+        ({"type": "gaussian", "mean": 0.03, "std": 0.001}, 0.1),
+        ({"type": "ornstein_uhlenbeck", "mean": 0.03, "std": 1e-3, "time_constant_s": 1.0}, 0.1),
+        ({"type": "band_limited", "mean": 0.03, "std": 1e-3, "correlation_s": 1.0}, 0.1),
+        ({"type": "random_walk", "start": 0.03, "per_sqrt_s": 1e-6}, 0.1),
+        ({"type": "random_walk", "start": 0.03, "per_sqrt_s": 0.0}, 0.03),
+    ],
+)
+def test_a_memory_is_as_long_as_a_signal_without_bounds_may_need(signal, most):
+    """That is the end of the channel's range, at any level but 0."""
+    for level, wanted in ((0.0, 0.0), (0.5, most if most == 0.1 else most / 2), (1.0, most)):
+        given = {**tree({"actuator.dead_time_s": signal}), "level": level}
+        scenario = load_scenario("infinity", disturbance=given)
+        assert longest(scenario, DEAD_TIME) == pytest.approx(wanted)
 
 
 @pytest.mark.parametrize("milliseconds", [0, 1, 7, 20])

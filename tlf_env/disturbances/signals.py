@@ -47,6 +47,10 @@ class _Signal(Frozen):
         """Smallest and largest value; four standard deviations where there is no bound."""
         raise NotImplementedError
 
+    def is_bounded(self) -> bool:
+        """Whether :meth:`reach` holds for every value; otherwise the channel's range alone does."""
+        return True
+
     def is_steady(self) -> bool:
         """Whether the value stays for a whole episode."""
         return False
@@ -198,6 +202,10 @@ class Gaussian(_Drawn):
         mean = _or(self.mean, nominal)
         return self.with_ramp(mean - TAILS * self.std, mean + TAILS * self.std, nominal)
 
+    def is_bounded(self) -> bool:
+        """Without noise."""
+        return self.std == 0.0
+
 
 class OrnsteinUhlenbeck(_Signal):
     """Stationary Gaussian noise with the autocorrelation exp(−|Δt| / ``time_constant_s``)."""
@@ -221,6 +229,10 @@ class OrnsteinUhlenbeck(_Signal):
         """Mean ± 4 standard deviations."""
         mean = _or(self.mean, nominal)
         return mean - TAILS * self.std, mean + TAILS * self.std
+
+    def is_bounded(self) -> bool:
+        """Without noise."""
+        return self.std == 0.0
 
 
 class BandLimited(_Signal):
@@ -247,6 +259,10 @@ class BandLimited(_Signal):
         """Mean ± 4 standard deviations."""
         mean = _or(self.mean, nominal)
         return mean - TAILS * self.std, mean + TAILS * self.std
+
+    def is_bounded(self) -> bool:
+        """Without noise."""
+        return self.std == 0.0
 
 
 class Pulses(_Signal):
@@ -295,6 +311,10 @@ class RandomWalk(_Signal):
         """Its start."""
         start = _or(self.start, nominal)
         return start, start
+
+    def is_bounded(self) -> bool:
+        """Without noise."""
+        return self.per_sqrt_s == 0.0
 
 
 Signal = Annotated[

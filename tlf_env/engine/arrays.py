@@ -232,12 +232,16 @@ def _all_patches(scenarios: Sequence[Scenario]) -> np.ndarray:
 
 
 def longest(scenario: Scenario, channel: int) -> float:
-    """The largest value that a channel can have; its range's end if an adversary may set it."""
-    if scenario.adversary and CHANNELS[channel].rate != EPISODE:
-        return CHANNELS[channel].high
-    reach = scenario.disturbance.signal(CHANNELS[channel].path).reach(CHANNELS[channel].nominal)
-    level = scenario.disturbance.level
-    return max(leveled(CHANNELS[channel].nominal, end, level) for end in reach)
+    """The largest value that a channel can have.
+
+    It is its range's end if an adversary may set it, or for a signal without a bound.
+    """
+    one, level = CHANNELS[channel], scenario.disturbance.level
+    signal = scenario.disturbance.signal(one.path)
+    imposed = scenario.adversary and one.rate != EPISODE
+    if imposed or (level > 0.0 and not signal.is_bounded()):
+        return one.high
+    return max(leveled(one.nominal, end, level) for end in signal.reach(one.nominal))
 
 
 def make_variants(scenarios: Sequence[Scenario], mixture: Sequence[float] = ()) -> Variants:
