@@ -14,6 +14,8 @@ from physics_helpers import (
     STILL,
     WITHOUT_JOINT_FRICTION,
     Run,
+    curve,
+    joint_torque,
     kinetic_energy,
     random_start,
     random_torques,
@@ -28,7 +30,6 @@ from tlf_env.physics.kernel import roll, slide, substep_frame
 from tlf_env.physics.parameters import (
     Body,
     FrictionCurve,
-    JointFriction,
     Mass,
     RobotParameters,
     body,
@@ -195,26 +196,6 @@ def substeps(made: Run) -> Substeps:
         cos * before.v_y - sin * before.v_x,
         cos * after.v_x + sin * after.v_y,
         cos * after.v_y - sin * after.v_x,
-    )
-
-
-def curve(mu: FrictionCurve, speed: np.ndarray) -> np.ndarray:
-    x = np.clip(
-        (np.abs(speed) - mu.stiction_speed_mm_s) / (mu.dynamic_speed_mm_s - mu.stiction_speed_mm_s),
-        0,
-        1,
-    )
-    return mu.mu_static + (mu.mu_dynamic - mu.mu_static) * x**2 * (3 - 2 * x)
-
-
-def joint_torque(joint: JointFriction, speed, axial, radial, moment) -> np.ndarray:
-    """Eq. (5)."""
-    lever = joint.pin_radius_mm / joint.bending_arm_mm
-    return curve(joint, speed) * (
-        joint.friction_arm_mm * np.abs(axial)
-        + joint.pin_radius_mm * np.abs(radial)
-        + lever * np.abs(moment)
-        + 1000 * joint.preload_Nmm
     )
 
 
