@@ -286,7 +286,7 @@ def test_the_bodies_of_a_robot_have_its_mass_inertia_and_motion(seed, robot):
         assert found == pytest.approx(
             motion._replace(**{still: 0.0}, angle_l=0.0, angle_r=0.0), abs=1e-9
         )
-    made.write(Motion(*motion[:4], *[1e-10] * 7, 0.0, 0.0))
+    made.write(Motion(*motion[:4], *[1e-12] * 7, 0.0, 0.0))
     found = made.read(0.0, 0.0)
     assert found[:4] == pytest.approx(motion[:4])
     assert found[4:] == (0.0,) * 9
