@@ -308,21 +308,6 @@ def check_joints(drive: Drive) -> None:
         assert (impulse * rate)[~sticks].max(initial=0) <= 0
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_momentum_changes_by_the_impulses(seed):
-    check_momentum(random_drive(seed))
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_tyres_stick_within_their_circle_or_oppose_their_slip(seed):
-    check_tyres(random_drive(seed))
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_joints_stick_within_eq_5_or_oppose_their_turning(seed):
-    check_joints(random_drive(seed))
-
-
 @pytest.mark.parametrize("seed", SHORT_SEEDS)
 def test_a_few_substeps_in_any_state_keep_all_laws(seed):
     drive = short_drive(seed)
@@ -466,6 +451,21 @@ def test_the_change_by_a_sweep_is_the_largest_speed_of_any_sign():
     all_changes(np.array(body(UNLIKE)).reshape(-1, 1, 1), rows, changes)
     speeds = speeds_of(UNLIKE, Sweep(*rows[:, 0]))
     assert changes == pytest.approx(np.abs(speeds[:, :, None] - speeds[:, None]).max(axis=0))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_momentum_changes_by_the_impulses(seed):
+    check_momentum(random_drive(seed))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_tyres_stick_within_their_circle_or_oppose_their_slip(seed):
+    check_tyres(random_drive(seed))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_joints_stick_within_eq_5_or_oppose_their_turning(seed):
+    check_joints(random_drive(seed))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
