@@ -336,7 +336,7 @@ def test_known_torques_cost_no_lag():
 
 
 def test_each_wheel_turns_as_both_torques_on_a_rolling_robot_say():
-    """Newton's and Euler's laws about the axle's midpoint, with the wheels' spins; an exact start stays exact."""
+    """Newton's and Euler's laws about the axle's midpoint; from an exact start nothing is to be corrected."""
     rng = np.random.default_rng(0)
     robot, row = body(ROBOT), speed_observer_row(80.0, body(ROBOT), DT_S)
     radius, half = ROBOT.wheel_radius_mm, ROBOT.axle_width_mm / 2
@@ -347,7 +347,7 @@ def test_each_wheel_turns_as_both_torques_on_a_rolling_robot_say():
     )
     assert robot.m == ROBOT.mass_kg
     state, angles, speeds = SpeedObserverState(*[0.0] * 6), np.zeros(2), np.zeros(2)
-    for left, right in rng.uniform(-15e3, 15e3, (200, 2)):
+    for left, right in rng.uniform(-5e3, 15e3, (200, 2)):
         forward = (left + right) / radius / mass
         turning = half * (right - left) / radius / inertia
         rates = np.array([forward - half * turning, forward + half * turning]) / radius
