@@ -28,7 +28,7 @@ from tlf_env.physics.pymunk_plant import (
 )
 from tlf_env.physics.space_state import body_row, hold, put_body, take_correction
 from tlf_env.physics.state import Motion
-from tlf_env.physics.world import World, capsule_rows, gap_to_walls
+from tlf_env.physics.world import World, capsule_rows, gap_to_walls, placed
 
 DISC = {"type": "circle", "radius_mm": 80.0}
 WALL = {"points_mm": [[-5000.0, 0.0], [5000.0, 0.0]], "thickness_mm": 0.0}
@@ -512,9 +512,9 @@ OUTLINE_MM = RobotParameters().outline_radius_mm
 PERIOD_S = 0.02
 
 
-def with_ball(x=3000.0, speed=0.0):
+def with_ball(x=3000.0, speed=0.0, outline=None):
     """A robot at the origin, and a ball of a user's at a distance along x."""
-    flight = Flight()
+    flight = Flight(robots=[outline or {}])
     ball = pymunk.Body(1.0, 500.0)
     ball.position, ball.velocity = (x, 0.0), (speed, 0.0)
     flight.plant.space(flight.motions, 0).add(ball, pymunk.Circle(ball, 20.0))
@@ -544,21 +544,31 @@ def test_objects_are_out_of_reach_as_long_as_none_can_come_close():
     assert answer(flight) == WITHIN_REACH
 
 
+@pytest.mark.parametrize("outline", [{}, {"outline_polygon_mm": RECTANGLE}])
 @pytest.mark.parametrize("theta", [0.0, 0.9, -2.5])
 @pytest.mark.parametrize("y", [30.0, 1500.0])
-def test_how_long_nothing_can_come_follows_from_the_distance_to_the_outline(theta, y):
-    """Nothing changes its speed by more than 6 m/s² before another look; a margin of 10 mm is kept."""
-    robot = RobotParameters()
+def test_how_long_nothing_can_come_follows_from_the_distance_to_the_outline(outline, theta, y):
+    """Nothing changes its speed by more than 6 m/s² before another look; a margin of 10 mm is kept.
+
+    The outline of a polygon is the circle around the box around it.
+    """
+    robot = RobotParameters(**outline)
     behind = robot.outline_offset_mm - robot.com_offset_mm
     counts = set()
-    for x in (-1300.0, -800.0, 300.0, 411.0, 700.0, 900.0):
-        flight, _ = with_ball()
+    for x in (-1300.0, -800.0, 320.0, 411.0, 700.0, 900.0):
+        flight, ball = with_ball(outline=outline)
         flight.put(0, 1000.0 + x, y - 400.0, theta=theta)
-        ball = next(body for body in flight.plant._space.bodies if body not in flight.plant.bodies)
         ball.position = 1000.0, y
         flight.plant._space.reindex_shapes_for_body(ball)
-        centre = 1000.0 + x + behind * math.sin(theta), y - 400.0 - behind * math.cos(theta)
-        apart = math.dist(centre, ball.position) - robot.outline_radius_mm - 20.0
+        place = 1000.0 + x, y - 400.0
+        if outline:
+            corners = np.add(RECTANGLE, (0.0, robot.com_offset_mm))
+            low, high = (side(placed(corners, *place, theta), axis=0) for side in (np.min, np.max))
+            centre, size = (low + high) / 2, math.dist(low, high) / 2
+        else:
+            centre = place[0] + behind * math.sin(theta), place[1] - behind * math.cos(theta)
+            size = robot.outline_radius_mm
+        apart = math.dist(centre, ball.position) - size - 20.0
         assert answer(flight, 5) == NO_OBJECTS
         steps = flight.plant._calm_until - 5
         assert steps == int(min(math.sqrt(2.0 * (apart - 10.0) / 6000.0), 2.0) / PERIOD_S)
