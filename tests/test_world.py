@@ -14,7 +14,6 @@ import pytest
 import tlf_env
 from tlf_env.physics.parameters import RobotParameters
 from tlf_env.physics.pymunk_plant import (
-    LARGEST_MOVE,
     NO_OBJECTS,
     OUT_OF_REACH,
     THETA,
@@ -555,7 +554,7 @@ def test_how_long_nothing_can_come_follows_from_the_distance_to_the_outline(outl
     robot = RobotParameters(**outline)
     behind = robot.outline_offset_mm - robot.com_offset_mm
     counts = set()
-    for x in (-1300.0, -800.0, 320.0, 411.0, 700.0, 900.0):
+    for x in np.linspace(320.0, 1300.0, 50):
         flight, ball = with_ball(outline=outline)
         flight.put(0, 1000.0 + x, y - 400.0, theta=theta)
         ball.position = 1000.0, y
@@ -633,14 +632,15 @@ def test_calm_is_kept_in_states_and_copies():
 
 
 def test_a_step_is_divided_for_the_fastest_body_whatever_comes_before_it():
+    """So that no part of it moves a body by more than a quarter of half its thickness."""
     flight, ball = with_ball(x=5000.0)
     still = pymunk.Body(1.0, 1.0)
     flight.plant._space.add(still, pymunk.Circle(still, 5.0))
     assert flight.plant._splits(0.001) == 1
-    ball.velocity = 20.0 / 0.001, 0.0  # its own half thickness in a step
-    assert flight.plant._splits(0.001) == math.ceil(1.0 / LARGEST_MOVE)
-    ball.velocity, ball.angular_velocity = (0.0, 0.0), 1.0 / 0.001
-    assert flight.plant._splits(0.001) == math.ceil(1.0 / LARGEST_MOVE)
+    ball.velocity = 10 * 20.0 / 0.001, 0.0  # ten times half its thickness in a step
+    assert flight.plant._splits(0.001) == 40
+    ball.velocity, ball.angular_velocity = (0.0, 0.0), 10.0 / 0.001
+    assert flight.plant._splits(0.001) == 40
 
 
 def test_pushed_things_that_hardly_move_stand_still():
