@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import pickle
 import re
@@ -22,7 +23,7 @@ from baselines import ReferencePolicy
 from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.onboard.estimator import EkfParameters
 from tlf_env.onboard.observer import Message, ObserverParameters, Reference
-from tlf_env.onboard.parts import Estimated, Readings
+from tlf_env.onboard.parts import Estimated, Readings, checked_covariance, make_part
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.parameters import RobotParameters
 
@@ -503,3 +504,31 @@ def test_what_the_page_shows_runs(monkeypatch: pytest.MonkeyPatch) -> None:
         env = tlf_env.parallel_env("infinity", **yaml.safe_load(robots))
         assert [robot.mass_kg for robot in env.scenario.robot_models] == [1.6] * 3
         assert np.isfinite(drive(env, 0.2)).all()
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_a_covariance_is_symmetric_but_for_rounding_at_any_scale(scale):
+    """A millionth of the product of both standard deviations is rounding."""
+    covariance = scale * np.array([[4.0, 1.0, 0.2], [1.0, 9.0, 0.3], [0.2, 0.3, 1.0]])
+    for share, fits in ((0.9e-6, True), (1.1e-6, False)):
+        other = covariance.copy()
+        other[0, 1] += share * scale * 2.0 * 3.0
+        if fits:
+            assert checked_covariance(other, "the estimator") is not None
+        else:
+            with pytest.raises(ValueError, match="a symmetric covariance"):
+                checked_covariance(other, "the estimator")
+
+
+def test_a_method_is_checked_after_one_without_a_signature():
+    class Odd:
+        def __init__(self, robot, period_s):
+            self.reset = {}.update  # of a built-in type: nothing says what it takes
+
+        def update(self):
+            """Takes no readings."""
+
+    with pytest.raises(ValueError, match=r"signature|no signature"):
+        inspect.signature({}.update)
+    with pytest.raises(ValueError, match=r"update\(\) cannot be called as update\(readings\)"):
+        make_part("estimator", "mine:Odd", Odd, RobotParameters(), 0.02)
