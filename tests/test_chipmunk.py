@@ -5,7 +5,10 @@ from __future__ import annotations
 import copy
 import gc
 import math
+import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -397,6 +400,35 @@ def test_limits_and_memory_of_a_substep_follow_from_its_state(seed):
     turning = steering.pin_radius_mm * (motion.s - motion.w)
     expected = joint_torque(steering, turning, load_c, 0.0, load_c * robot.T)
     assert limits[8] == pytest.approx(expected)
+
+
+READY = """
+import numpy as np
+from physics_helpers import DT_S, NO_MEMORY, ROBOT, STILL, complete, FLOOR
+from tlf_env.physics.chipmunk_plant import ChipmunkPlant, record, set_limits
+
+plant = ChipmunkPlant([ROBOT])
+rows = (np.array(row)[:, None, None].copy() for row in (STILL, NO_MEMORY, complete(FLOOR)))
+motions, contacts, floors = rows
+plant.compile(motions, contacts, floors, DT_S)
+before = [len(one.overloads) for one in (set_limits, record)]
+plant.sort(motions)
+plant.advance(motions, contacts, np.zeros((2, 1, 1)), floors, DT_S)
+after = [len(one.overloads) for one in (set_limits, record)]
+assert before == after == [1, 1], (before, after)
+"""
+
+
+def test_the_drivers_of_a_substep_are_there_before_the_first_one():
+    """In a process of its own, as others here have loaded them."""
+    done = subprocess.run(
+        [sys.executable, "-c", READY],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert done.returncode == 0, done.stderr
 
 
 # --- contact -----------------------------------------------------------------------------------------
