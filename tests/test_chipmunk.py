@@ -402,6 +402,52 @@ def test_limits_and_memory_of_a_substep_follow_from_its_state(seed):
     assert limits[8] == pytest.approx(expected)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_recorded_of_a_substep_moves_its_wheels(seed):
+    """Tyre and joint make each wheel's change of spin; the slips are those of the motion."""
+    rng = np.random.default_rng(seed)
+    starts = [random_start(rng, 0.5) for _ in range(3)]
+    plant = ChipmunkPlant([ROBOT] * 3)
+    motions = np.array(starts).T[:, :, None].copy()
+    motions[0, :, 0] = [0.0, 1e4, 2e4]
+    contacts = np.repeat(np.array(NO_MEMORY)[:, None, None], 3, axis=1)
+    floors = np.repeat(np.array(complete((30.0, -20.0, 1.0, 0.8, 0.9)))[:, None, None], 3, axis=1)
+    torques = rng.uniform(-1e4, 1e4, (2, 3, 1))
+    before = motions[:, :, 0].copy()
+    plant.sort(motions)
+    plant.advance(motions, contacts, torques, floors, DT_S)
+    first, after = Motion(*before), Motion(*motions[:, :, 0])
+    found, robot = Contact(*contacts[:, :, 0]), body(ROBOT)
+    for spins, others, torque, q, p in (
+        (first.omega_l, after.omega_l, torques[0, :, 0], found.q_l, found.p_lf),
+        (first.omega_r, after.omega_r, torques[1, :, 0], found.q_r, found.p_rf),
+    ):
+        turned = robot.J * (others - spins) - DT_S * torque + robot.R * p
+        assert np.abs(turned) == pytest.approx(q, abs=1e-6)
+        assert np.abs(p).min() > 0.0
+    across = plant._impulses[0]
+    assert found.p_le + found.p_re == pytest.approx(across)
+    loads = robot.load_drive * 1.0, robot.load_drive * 0.8
+    for load, p_e, p_f in zip(
+        loads, (found.p_le, found.p_re), (found.p_lf, found.p_rf), strict=True
+    ):
+        assert (np.hypot(p_e, p_f) <= robot.mu_static * load * DT_S * (1 + 1e-9)).all()
+    sin, cos = np.sin(after.theta), np.cos(after.theta)
+    side = after.v_x * cos + after.v_y * sin
+    ahead = after.v_y * cos - after.v_x * sin
+    half = robot.h * after.w
+    left = ahead - half - robot.R * after.omega_l - 30.0
+    right = ahead + half - robot.R * after.omega_r + 20.0
+    assert found.slip_l == pytest.approx(np.hypot(side - robot.d * after.w, left))
+    assert found.slip_r == pytest.approx(np.hypot(side - robot.d * after.w, right))
+    sin, cos = np.sin(after.psi - after.theta), np.cos(after.psi - after.theta)
+    pivot = side + robot.q * after.w
+    x_c = pivot * cos + ahead * sin + robot.T * after.s
+    y_c = ahead * cos - pivot * sin - robot.R_c * after.omega_c
+    assert found.slip_c == pytest.approx(np.hypot(x_c, y_c))
+    assert np.array_equal(plant._impulses[[3, 4, 7, 8]], contacts[[4, 5, 8, 9], :, 0])
+
+
 READY = """
 import numpy as np
 from physics_helpers import DT_S, NO_MEMORY, ROBOT, STILL, complete, FLOOR
