@@ -158,3 +158,22 @@ def test_tyres_side_by_side_are_solved_as_one_by_one_also_beside_one_without_an_
     tyres_together(circles, together)
     assert np.array_equal(together, alone, equal_nan=True)
     assert np.isnan(alone).any() == (seed % 4 == 0)
+
+
+def test_robots_whose_castors_all_turn_get_the_bits_of_one_by_one():
+    rng = np.random.default_rng(0)
+    starts = [random_start(rng)._replace(w=-2.0, s=6.0 + i) for i in range(SLIDE_COLUMNS)]
+    motions = np.array(starts).T.copy()
+    bodies = np.repeat(np.array(body(RobotParameters()))[:, None], SLIDE_COLUMNS, axis=1)
+    contacts = np.zeros((len(Contact._fields), SLIDE_COLUMNS))
+    floors = np.zeros((len(Floor._fields), SLIDE_COLUMNS))
+    floors[2:5] = 1.0
+    torques, slides = np.zeros((2, SLIDE_COLUMNS)), np.ones(SLIDE_COLUMNS, dtype=np.bool_)
+    one, many = (motions.copy(), contacts.copy()), (motions.copy(), contacts.copy())
+    for _ in range(3):
+        alone(bodies, *one, floors, torques, slides)
+        together(bodies, *many, floors, torques, slides)
+        for got, wanted in zip(many, one, strict=True):
+            assert got.tobytes() == wanted.tobytes()
+    turning = one[0][Motion._fields.index("s")] - one[0][Motion._fields.index("w")]
+    assert np.abs(turning).min() > 1.0

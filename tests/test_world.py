@@ -337,6 +337,17 @@ def test_contacts_that_no_space_has_are_refused(crowded):
     refused("no number of their own", shape_numbers=numbers)
 
 
+def test_what_is_in_a_space_does_not_depend_on_what_has_happened_there(crowded):
+    _, moments = crowded
+    fresh, used = crowd().plant, crowd()
+    control_step(used, 0)
+    used.plant.reset(shapes_by=moments[0][1]["shape_numbers"] + 100)
+    assert used.plant.structure() == fresh.structure()
+    other = crowd().plant
+    next(iter(other.pushable_bodies[0].shapes)).friction = 0.9
+    assert other.structure() != fresh.structure()
+
+
 def overlapping():
     """Two boxes that overlap and turn, after a step that has seen it."""
     space = pymunk.Space()

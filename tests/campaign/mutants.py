@@ -124,6 +124,7 @@ LAW_FILES = (
     "sensors",
     "kernel",
     "world",
+    "chipmunk",
 )
 PLAIN_FILES = (
     "table_1",
