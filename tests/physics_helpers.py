@@ -11,7 +11,13 @@ from numpy.typing import ArrayLike
 
 from tlf_env.numerics.compiled import driver
 from tlf_env.physics.kernel import substep
-from tlf_env.physics.parameters import Body, RobotParameters, body
+from tlf_env.physics.parameters import (
+    Body,
+    FrictionCurve,
+    JointFriction,
+    RobotParameters,
+    body,
+)
 from tlf_env.physics.state import (
     Contact,
     Floor,
@@ -197,3 +203,24 @@ def first(starts: Callable[[float], bool], low: float, high: float, width: float
 
 def forward_speed(motion: Motion) -> np.ndarray:
     return -motion.v_x * np.sin(motion.theta) + motion.v_y * np.cos(motion.theta)
+
+
+def curve(mu: FrictionCurve, speed: np.ndarray) -> np.ndarray:
+    """Coefficient of Fig. 3(b) at speeds in mm/s."""
+    x = np.clip(
+        (np.abs(speed) - mu.stiction_speed_mm_s) / (mu.dynamic_speed_mm_s - mu.stiction_speed_mm_s),
+        0,
+        1,
+    )
+    return mu.mu_static + (mu.mu_dynamic - mu.mu_static) * x**2 * (3 - 2 * x)
+
+
+def joint_torque(joint: JointFriction, speed, axial, radial, moment) -> np.ndarray:
+    """Eq. (5), mN·mm."""
+    lever = joint.pin_radius_mm / joint.bending_arm_mm
+    return curve(joint, speed) * (
+        joint.friction_arm_mm * np.abs(axial)
+        + joint.pin_radius_mm * np.abs(radial)
+        + lever * np.abs(moment)
+        + 1000 * joint.preload_Nmm
+    )

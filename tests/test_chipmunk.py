@@ -5,7 +5,10 @@ from __future__ import annotations
 import copy
 import gc
 import math
+import os
 import pickle
+import subprocess
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -22,7 +25,9 @@ from physics_helpers import (
     STILL,
     WITHOUT_JOINT_FRICTION,
     complete,
+    curve,
     forward_speed,
+    joint_torque,
     kinetic_energy,
     random_start,
     random_torques,
@@ -31,7 +36,7 @@ from physics_helpers import (
 
 import tlf_env
 from baselines import ReferencePolicy
-from tlf_env.physics.chipmunk_plant import ChipmunkPlant
+from tlf_env.physics.chipmunk_plant import ARM_MM, FORCES, ChipmunkPlant, RobotBodies
 from tlf_env.physics.openloop import COLUMNS, load_scenarios, run_open_loop
 from tlf_env.physics.parameters import RobotParameters, body
 from tlf_env.physics.state import Contact, Floor, Motion
@@ -228,6 +233,248 @@ def test_a_long_arm_of_the_castor_leaves_inertia_to_the_chassis():
     chassis = plant.bodies[0]
     assert chassis.moment > 0.1 * long.body_inertia_kg_mm2
     assert 0 < chassis.mass < long.mass_kg
+
+
+def placed_robot(seed, robot=ROBOT):
+    """A robot's bodies before a substep, the motion that they have, spins, and speeds of the floor."""
+    rng = np.random.default_rng(seed)
+    motion = random_start(rng)._replace(psi=rng.uniform(-4, 4))
+    space, chassis = pymunk.Space(), pymunk.Body(1.0, 1.0)
+    space.add(chassis)
+    made = RobotBodies(chassis, body(robot))
+    made.join(space)
+    made.write(motion)
+    spins, belts = rng.uniform(-20, 20, 2), rng.uniform(-80, 80, 2)
+    made.place(spins.tolist(), belts.tolist(), DT_S)
+    return made, motion, spins, belts
+
+
+LONG_FORK = RobotParameters(
+    castor_pivot_mm=140.0, castor_trail_mm=60.0, com_offset_mm=40.0, castor_radius_mm=27.0
+)
+
+
+@pytest.mark.parametrize("robot", [ROBOT, LONG_FORK], ids=["default", "long fork"])
+@pytest.mark.parametrize("seed", range(5))
+def test_the_bodies_of_a_robot_have_its_mass_inertia_and_motion(seed, robot):
+    made, motion, spins, _ = placed_robot(seed, robot)
+    parts = [made.chassis, made.fork]
+    masses = np.array([part.mass for part in parts])
+    centres = np.array([part.local_to_world(part.center_of_gravity) for part in parts])
+    # A body's velocity in pymunk is that of its centre of mass.
+    speeds = np.array([tuple(part.velocity) for part in parts])
+    assert masses.sum() == pytest.approx(robot.mass_kg)
+    assert masses @ centres / masses.sum() == pytest.approx([motion.x, motion.y])
+    assert masses @ speeds / masses.sum() == pytest.approx([motion.v_x, motion.v_y])
+    away, relative = centres - [motion.x, motion.y], speeds - [motion.v_x, motion.v_y]
+    turning = masses @ (away[:, 0] * relative[:, 1] - away[:, 1] * relative[:, 0])
+    turning += made.chassis.moment * motion.w
+    assert turning == pytest.approx(robot.body_inertia_kg_mm2 * motion.w)
+    assert made.fork.moment == robot.fork_inertia_kg_mm2
+    inertias = 2 * [robot.wheel_inertia_kg_mm2] + [robot.castor_inertia_kg_mm2]
+    assert [spin.moment for spin in made.spins] == inertias
+    pivot = made.chassis.local_to_world((0.0, com_to_pivot(robot)))
+    assert tuple(made.fork.position) == pytest.approx(tuple(pivot))
+    joint = made.constraints[-1]
+    assert made.fork.local_to_world(joint.anchor_b) == pytest.approx(
+        made.chassis.local_to_world(joint.anchor_a)
+    )
+    assert joint.max_bias == 0.0
+    read = made.read(motion.angle_l, motion.angle_r)
+    expected = motion._replace(omega_l=spins[0], omega_r=spins[1])
+    assert read == pytest.approx(expected)
+    for still in ("v_x", "v_y", "w", "s", "omega_c"):
+        made.write(motion._replace(**{still: 0.0}))
+        found = made.read(0.0, 0.0)
+        assert found == pytest.approx(
+            motion._replace(**{still: 0.0}, angle_l=0.0, angle_r=0.0), abs=1e-9
+        )
+    made.write(Motion(*motion[:4], *[1e-12] * 7, 0.0, 0.0))
+    found = made.read(0.0, 0.0)
+    assert found[:4] == pytest.approx(motion[:4])
+    assert found[4:] == (0.0,) * 9
+
+
+def com_to_pivot(robot):
+    """Place of the fork's pivot ahead of the centre of mass, mm."""
+    return robot.com_offset_mm - robot.castor_pivot_mm
+
+
+@pytest.mark.parametrize("robot", [ROBOT, LONG_FORK], ids=["default", "long fork"])
+@pytest.mark.parametrize("seed", range(5))
+def test_each_tyre_pulls_at_its_place_and_along_its_direction(seed, robot):
+    """After Chipmunk has moved the bodies, in every constraint of a tyre the two ends lie as they should.
+
+    Those of the axle to the right of each other, those of the drive wheels ahead of each other, and so for
+    the castor and its fork; the speed of the ends is that of the tyre over the floor.
+    """
+    made, motion, spins, belts = placed_robot(seed, robot)
+    for part in (made.chassis, *made.bodies):
+        pymunk.Body.update_position(part, DT_S)
+    theta, psi = motion.theta + DT_S * motion.w, motion.psi + DT_S * motion.s
+    right, ahead = ((math.cos(angle), math.sin(angle)) for angle in (theta, psi))
+    right, ahead = np.array(right), np.array([-right[1], right[0]])
+    fork_right = np.array([math.cos(psi), math.sin(psi)])
+    fork_ahead = np.array([-fork_right[1], fork_right[0]])
+    axle = np.array(made.chassis.local_to_world((0.0, robot.com_offset_mm)))
+    half = robot.axle_width_mm / 2
+    contact = np.array(made.fork.local_to_world((0.0, -robot.castor_trail_mm)))
+    places = [axle, axle - half * right, axle + half * right, contact, contact]
+    ways = [right, ahead, ahead, fork_right, fork_ahead]
+    radius, castor = robot.wheel_radius_mm, robot.castor_radius_mm
+    rims = [
+        None,
+        radius * spins[0] + belts[0],
+        radius * spins[1] + belts[1],
+        None,
+        castor * motion.omega_c,
+    ]
+    for i, (tyre, place, way, rim) in enumerate(zip(made.tyres(), places, ways, rims, strict=True)):
+        first, last = (
+            np.array(one.local_to_world(anchor))
+            for one, anchor in ((tyre.a, tyre.anchor_a), (tyre.b, tyre.anchor_b))
+        )
+        assert last - first == pytest.approx(ARM_MM * way, abs=1e-6), FORCES[i]
+        at_robot = last if rim is None else first
+        assert at_robot == pytest.approx(place, abs=1e-9), FORCES[i]
+        assert tyre.max_bias == 0.0
+        speed = tyre.b.velocity_at_local_point(tyre.anchor_b) @ way if rim is not None else 0.0
+        assert speed == pytest.approx(rim or 0.0, rel=1e-9, abs=1e-9), FORCES[i]
+        if rim is None:
+            still = tyre.a.velocity_at_local_point(tyre.anchor_a)
+            assert tuple(still) == (0.0, 0.0)
+
+
+def test_a_push_acts_at_the_centre_of_mass_besides_a_users_force():
+    plant = ChipmunkPlant([ROBOT, ROBOT])
+    motions = np.repeat(np.array(STILL._replace(theta=0.8, psi=0.8))[:, None, None], 2, axis=1)
+    motions[0, 1] = 1000.0
+    plant.space(motions, 0)
+    plant.bodies[1].force, plant.bodies[1].torque = (100.0, -50.0), 700.0
+    plant.sort(motions)
+    pushes = np.array([[300.0, -200.0], [40.0, 10.0], [5000.0, -900.0]])
+    plant._push(pushes)
+    forces = {body: (np.array(force), torque) for body, force, torque in plant._forces}
+    for i, (own, own_torque) in enumerate([((0.0, 0.0), 0.0), ((100.0, -50.0), 700.0)]):
+        force, torque = forces[plant.bodies[i]]
+        assert force == pytest.approx(pushes[:2, i] + own)
+        # Chipmunk lets a force act at the chassis' own centre of mass, ahead of the robot's.
+        away = np.array(plant.bodies[i].local_to_world(plant.bodies[i].center_of_gravity))
+        away -= motions[:2, i, 0]
+        about_the_robot = torque - own_torque + away[0] * pushes[1, i] - away[1] * pushes[0, i]
+        assert about_the_robot == pytest.approx(pushes[2, i])
+    plant._push(np.zeros((3, 2)))
+    forces = {body: (tuple(force), torque) for body, force, torque in plant._forces}
+    assert forces[plant.bodies[0]] == ((0.0, 0.0), 0.0)
+    assert forces[plant.bodies[1]] == ((100.0, -50.0), 700.0)
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_limits_and_memory_of_a_substep_follow_from_its_state(seed):
+    """The joints have the kernel's limits; a tyre's two limits lie on its circle or have the same room."""
+    rng = np.random.default_rng(seed)
+    plant = ChipmunkPlant([ROBOT])
+    motion = random_start(rng, 10.0 ** rng.uniform(-2, 0))
+    motions = np.array(motion)[:, None, None].copy()
+    slips = rng.uniform(0, 5, 3)
+    contacts = np.array(NO_MEMORY._replace(slip_l=slips[0], slip_r=slips[1], slip_c=slips[2]))
+    contacts = contacts[:, None, None].copy()
+    floors = np.array(complete((20.0, -10.0, 0.9, 0.8, 0.7)))[:, None, None].copy()
+    plant._limit(motions, contacts, floors, np.zeros((2, 1)), DT_S)
+    limits = plant._limits[:, 0]
+    robot = body(ROBOT)
+    mu = curve(ROBOT.tyre, slips)
+    grips = mu * [robot.load_drive, robot.load_drive, robot.load_castor] * [0.9, 0.8, 0.7]
+    across = [limits[0] / 2, limits[0] / 2, limits[3]]
+    along = [limits[1], limits[2], limits[4]]
+    assert (np.array(along) <= grips * (1 + 1e-9)).all()
+    assert np.hypot(across[2], along[2]) == pytest.approx(grips[2])
+    sides = limits[0] - np.sqrt(np.maximum(grips[:2] ** 2 - np.array(along[:2]) ** 2, 0.0)).sum()
+    assert sides == pytest.approx(0.0, abs=1e-6 * grips.sum())
+    load, load_c = robot.load_drive, robot.load_castor
+    rims = robot.R * motion.omega_l, robot.R * motion.omega_r, robot.R_c * motion.omega_c
+    joints = ROBOT.drive_joint, ROBOT.drive_joint, ROBOT.castor_joint
+    for i, (rim, joint, carried) in enumerate(zip(rims, joints, (load, load, load_c), strict=True)):
+        assert limits[5 + i] == pytest.approx(joint_torque(joint, rim, 0.0, carried, 0.0))
+    steering = ROBOT.steering_joint
+    turning = steering.pin_radius_mm * (motion.s - motion.w)
+    expected = joint_torque(steering, turning, load_c, 0.0, load_c * robot.T)
+    assert limits[8] == pytest.approx(expected)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_what_is_recorded_of_a_substep_moves_its_wheels(seed):
+    """Tyre and joint make each wheel's change of spin; the slips are those of the motion."""
+    rng = np.random.default_rng(seed)
+    starts = [random_start(rng, 0.5) for _ in range(3)]
+    plant = ChipmunkPlant([ROBOT] * 3)
+    motions = np.array(starts).T[:, :, None].copy()
+    motions[0, :, 0] = [0.0, 1e4, 2e4]
+    contacts = np.repeat(np.array(NO_MEMORY)[:, None, None], 3, axis=1)
+    floors = np.repeat(np.array(complete((30.0, -20.0, 1.0, 0.8, 0.9)))[:, None, None], 3, axis=1)
+    torques = rng.uniform(-1e4, 1e4, (2, 3, 1))
+    before = motions[:, :, 0].copy()
+    plant.sort(motions)
+    plant.advance(motions, contacts, torques, floors, DT_S)
+    first, after = Motion(*before), Motion(*motions[:, :, 0])
+    found, robot = Contact(*contacts[:, :, 0]), body(ROBOT)
+    for spins, others, torque, q, p in (
+        (first.omega_l, after.omega_l, torques[0, :, 0], found.q_l, found.p_lf),
+        (first.omega_r, after.omega_r, torques[1, :, 0], found.q_r, found.p_rf),
+    ):
+        turned = robot.J * (others - spins) - DT_S * torque + robot.R * p
+        assert np.abs(turned) == pytest.approx(q, abs=1e-6)
+        assert np.abs(p).min() > 0.0
+    across = plant._impulses[0]
+    assert found.p_le + found.p_re == pytest.approx(across)
+    loads = robot.load_drive * 1.0, robot.load_drive * 0.8
+    for load, p_e, p_f in zip(
+        loads, (found.p_le, found.p_re), (found.p_lf, found.p_rf), strict=True
+    ):
+        assert (np.hypot(p_e, p_f) <= robot.mu_static * load * DT_S * (1 + 1e-9)).all()
+    sin, cos = np.sin(after.theta), np.cos(after.theta)
+    side = after.v_x * cos + after.v_y * sin
+    ahead = after.v_y * cos - after.v_x * sin
+    half = robot.h * after.w
+    left = ahead - half - robot.R * after.omega_l - 30.0
+    right = ahead + half - robot.R * after.omega_r + 20.0
+    assert found.slip_l == pytest.approx(np.hypot(side - robot.d * after.w, left))
+    assert found.slip_r == pytest.approx(np.hypot(side - robot.d * after.w, right))
+    sin, cos = np.sin(after.psi - after.theta), np.cos(after.psi - after.theta)
+    pivot = side + robot.q * after.w
+    x_c = pivot * cos + ahead * sin + robot.T * after.s
+    y_c = ahead * cos - pivot * sin - robot.R_c * after.omega_c
+    assert found.slip_c == pytest.approx(np.hypot(x_c, y_c))
+    assert np.array_equal(plant._impulses[[3, 4, 7, 8]], contacts[[4, 5, 8, 9], :, 0])
+
+
+READY = """
+import numpy as np
+from physics_helpers import DT_S, NO_MEMORY, ROBOT, STILL, complete, FLOOR
+from tlf_env.physics.chipmunk_plant import ChipmunkPlant, record, set_limits
+
+plant = ChipmunkPlant([ROBOT])
+rows = (np.array(row)[:, None, None].copy() for row in (STILL, NO_MEMORY, complete(FLOOR)))
+motions, contacts, floors = rows
+plant.compile(motions, contacts, floors, DT_S)
+before = [len(one.overloads) for one in (set_limits, record)]
+plant.sort(motions)
+plant.advance(motions, contacts, np.zeros((2, 1, 1)), floors, DT_S)
+after = [len(one.overloads) for one in (set_limits, record)]
+assert before == after == [1, 1], (before, after)
+"""
+
+
+def test_the_drivers_of_a_substep_are_there_before_the_first_one():
+    """In a process of its own, as others here have loaded them."""
+    done = subprocess.run(
+        [sys.executable, "-c", READY],
+        capture_output=True,
+        text=True,
+        check=False,
+        env={**os.environ, "PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    assert done.returncode == 0, done.stderr
 
 
 # --- contact -----------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.optimize import brentq, minimize
 
 from tlf_env.physics.friction import coefficient, disc
+from tlf_env.physics.parameters import FrictionCurve
 
 untimed = settings(deadline=None)  # the first call compiles
 
@@ -159,3 +160,18 @@ def test_disc_minimises_the_energy_within_the_circle(seed):
     p, _ = solve(W, b, radius)
     assert energy(p) == pytest.approx(best.fun, rel=1e-7)
     assert p == pytest.approx(best.x, abs=1e-4 * radius)
+
+
+def test_a_curve_has_at_most_its_static_coefficient_above_a_higher_speed():
+    fields = {
+        "mu_static": 0.5,
+        "mu_dynamic": 0.5,
+        "stiction_speed_mm_s": 2.0,
+        "dynamic_speed_mm_s": 2.5,
+    }
+    assert FrictionCurve(**fields).mu_dynamic == 0.5
+    with pytest.raises(ValueError, match=r"mu_dynamic 0.51 must be at most mu_static 0.5"):
+        FrictionCurve(**fields | {"mu_dynamic": 0.51})
+    for speed in (1.9, 2.0):
+        with pytest.raises(ValueError, match=rf"dynamic_speed_mm_s {speed} must be above .* 2.0"):
+            FrictionCurve(**fields | {"dynamic_speed_mm_s": speed})

@@ -13,6 +13,7 @@ from baselines.policies.registry import fit_policy
 from baselines.runs.outcome import failed
 from baselines.runs.run import run_seeds
 from tlf_env import load_scenario, parallel_env
+from tlf_env.onboard.controllers import ControllerFile
 from tlf_env.onboard.estimator import Estimate
 from tlf_env.onboard.gyro_estimator import (
     ACCELERATION_TIME_S,
@@ -25,6 +26,7 @@ from tlf_env.onboard.gyro_estimator import (
     quietness,
     reported_slip,
 )
+from tlf_env.onboard.slip_estimator import SlipEkfParameters
 from tlf_env.physics.vehicle import RobotParameters, body
 
 DT_S = 0.001
@@ -382,3 +384,16 @@ def test_the_default_holds_a_floor_with_little_grip(friction_scale):
     assert not any(map(failed, runs))
     worst_mm = [max(robot.position_rmse_mm for robot in run) for run in runs]
     assert np.median(worst_mm) < 1.0
+
+
+@pytest.mark.parametrize(("field", "kind"), [("ekf_gyro", "ekf-gyro"), ("ekf_slip", "ekf-slip")])
+def test_a_controller_file_with_numbers_of_a_filter_names_it_and_gives_all_its_numbers(field, kind):
+    numbers = {"fix_variance_time_s": None}  # which is not the default
+    given = ControllerFile(controller="printed", **{field: numbers})
+    parameters = {"ekf_gyro": GyroEkfParameters, "ekf_slip": SlipEkfParameters}[field]
+    whole = parameters(**numbers).model_dump()
+    assert given.scenario_overrides == {"estimator": kind, field: whole}
+    assert whole["fix_variance_time_s"] is None
+    other = ControllerFile(controller="printed", estimator="ekf", **{field: numbers})
+    assert other.scenario_overrides["estimator"] == "ekf"
+    assert ControllerFile(controller="printed").scenario_overrides == {}

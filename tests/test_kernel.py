@@ -14,6 +14,8 @@ from physics_helpers import (
     STILL,
     WITHOUT_JOINT_FRICTION,
     Run,
+    curve,
+    joint_torque,
     kinetic_energy,
     random_start,
     random_torques,
@@ -23,12 +25,11 @@ from physics_helpers import (
 )
 
 from tlf_env.numerics.compiled import driver
-from tlf_env.numerics.rows import row_writer
-from tlf_env.physics.kernel import substep_frame
+from tlf_env.numerics.rows import reader, row_writer, writer
+from tlf_env.physics.kernel import roll, slide, substep_frame
 from tlf_env.physics.parameters import (
     Body,
     FrictionCurve,
-    JointFriction,
     Mass,
     RobotParameters,
     body,
@@ -41,15 +42,50 @@ from tlf_env.physics.state import (
     Rates,
     conveyor,
     read_body,
+    read_contact,
     read_motion,
+    write_motion,
 )
-from tlf_env.physics.sweeps import begin_sweeps, sweep
+from tlf_env.physics.sweeps import (
+    SWEEP_CAP,
+    SWEEP_TOLERANCE_MM_S,
+    Sweep,
+    begin_sweeps,
+    change_of,
+    sweep,
+    sweep_on,
+)
 
 SEEDS = range(24)
 SECONDS = 2.0
-WEIGHT_mN = ROBOT.mass_kg * ROBOT.gravity_mm_s2
+SHORT_SEEDS = range(60)
+SHORT_STEPS = 6
+# No two of its lengths, masses or friction arms are the default robot's.
+UNLIKE = RobotParameters(
+    mass_kg=3.1,
+    body_inertia_kg_mm2=21_000.0,
+    axle_width_mm=151.0,
+    com_offset_mm=31.0,
+    wheel_radius_mm=27.0,
+    castor_radius_mm=13.0,
+    castor_pivot_mm=83.0,
+    castor_trail_mm=17.0,
+    drive_load_share=0.345,
+    castor_load_share=0.31,
+)
+STAGES = 80  # more sweeps than any of the cases here needs
 write_rates = row_writer(Rates, 0)
-LOADS = np.array([ROBOT.drive_load_share] * 2 + [ROBOT.castor_load_share]) * WEIGHT_mN
+read_sweep, write_sweep = reader(Sweep), writer(Sweep)
+read_floor, read_push = reader(Floor), reader(Push)
+
+
+def loads_of(robot: RobotParameters) -> np.ndarray:
+    """On left wheel, right wheel and castor, mN."""
+    shares = [robot.drive_load_share] * 2 + [robot.castor_load_share]
+    return np.array(shares) * robot.mass_kg * robot.gravity_mm_s2
+
+
+LOADS = loads_of(ROBOT)
 
 
 class Drive(NamedTuple):
@@ -57,6 +93,7 @@ class Drive(NamedTuple):
     push: np.ndarray
     floor: Floor
     run: Run
+    robot: RobotParameters
 
 
 def random_drive(seed: int, robot: RobotParameters = ROBOT) -> Drive:
@@ -72,7 +109,59 @@ def random_drive(seed: int, robot: RobotParameters = ROBOT) -> Drive:
     belts = rng.uniform(-50, 50, 2) * (seed % 3 == 2)
     floor = FLOOR._replace(conveyor_l=belts[0], conveyor_r=belts[1])
     made = run(robot, start, seconds=SECONDS, torques_Nmm=torques, push=push, floor=floor)
-    return Drive(torques, push, floor, made)
+    return Drive(torques, push, floor, made, robot)
+
+
+def with_fork_at_rest(robot: RobotParameters, start: Motion, forward: float, yaw: float) -> Motion:
+    """A rolling robot on a circle, whose castor angle stays as it is: nothing slips and s = w."""
+    across = yaw * robot.castor_pivot_mm
+    phi = math.asin(-yaw * robot.castor_trail_mm / math.hypot(forward, across))
+    phi -= math.atan2(across, forward)
+    along = forward * math.cos(phi) - across * math.sin(phi)
+    return start._replace(psi=start.theta + phi, omega_c=along / robot.castor_radius_mm)
+
+
+def short_drive(seed: int) -> Drive:
+    """A few substeps, so that many cases take little time, also where the laws are not compiled.
+
+    Every other robot goes on rolling, so that the closed form holds, with its steering stuck or turning. The
+    others slide, spin or are nearly at rest, on weak grip, with creep and pushes.
+    """
+    rng = np.random.default_rng(seed)
+    robot = (ROBOT, WITHOUT_JOINT_FRICTION, UNLIKE)[seed % 3]
+    belts = rng.uniform(-50, 50, 2) * rng.integers(2)
+    rolls, grips, creep = seed % 2 == 1, np.ones(3), 0.0
+    if rolls:
+        forward, yaw = rng.choice([-1, 1]) * rng.uniform(100, 500), rng.uniform(-0.6, 0.6)
+        start = rolling(robot, forward, yaw)
+        still = 7.0 * np.sign(forward) * robot.joint_friction
+        torques = still + rng.uniform(-1, 1, (SHORT_STEPS, 2))
+        push = rng.uniform(-1, 1, 3) * [20, 20, 1e3]
+        spins = belts / robot.wheel_radius_mm
+        start = start._replace(omega_l=start.omega_l - spins[0], omega_r=start.omega_r - spins[1])
+        if seed % 4 == 3:
+            start = with_fork_at_rest(robot, start, forward, yaw)
+    else:
+        start = random_start(rng, 10.0 ** rng.uniform(-3, 0))
+        if seed % 8 == 0:
+            start = start._replace(s=start.w)
+        torques = rng.uniform(-14, 14, (SHORT_STEPS, 2))
+        push = rng.uniform(-1, 1, 3) * [1000, 1000, 5e4] * rng.integers(2)
+        grips = rng.uniform(0.1, 1.2, 3)
+        creep = 0.05 * (seed % 6 == 0)
+    turn = rng.uniform(-3, 3)
+    cos, sin = math.cos(turn), math.sin(turn)
+    start = start._replace(
+        theta=start.theta + turn,
+        psi=start.psi + turn,
+        v_x=cos * start.v_x - sin * start.v_y,
+        v_y=sin * start.v_x + cos * start.v_y,
+    )
+    floor = Floor(*belts, *grips, 0.02 * rng.integers(2), creep)
+    made = run(
+        robot, start, seconds=SHORT_STEPS * DT_S, torques_Nmm=torques, push=push, floor=floor
+    )
+    return Drive(torques, push, floor, made, robot)
 
 
 class Substeps(NamedTuple):
@@ -110,30 +199,10 @@ def substeps(made: Run) -> Substeps:
     )
 
 
-def curve(mu: FrictionCurve, speed: np.ndarray) -> np.ndarray:
-    x = np.clip(
-        (np.abs(speed) - mu.stiction_speed_mm_s) / (mu.dynamic_speed_mm_s - mu.stiction_speed_mm_s),
-        0,
-        1,
-    )
-    return mu.mu_static + (mu.mu_dynamic - mu.mu_static) * x**2 * (3 - 2 * x)
-
-
-def joint_torque(joint: JointFriction, speed, axial, radial, moment) -> np.ndarray:
-    """Eq. (5)."""
-    lever = joint.pin_radius_mm / joint.bending_arm_mm
-    return curve(joint, speed) * (
-        joint.friction_arm_mm * np.abs(axial)
-        + joint.pin_radius_mm * np.abs(radial)
-        + lever * np.abs(moment)
-        + 1000 * joint.preload_Nmm
-    )
-
-
-@pytest.mark.parametrize("seed", SEEDS)
-def test_momentum_changes_by_the_impulses(seed):
-    torques, push, _, made = random_drive(seed)
-    r, t = body(ROBOT), substeps(made)
+def check_momentum(drive: Drive) -> None:
+    """All bodies change their momenta by the impulses, and fork and wheels turn with the new rates."""
+    torques, push, _, made, robot = drive
+    r, t = body(robot), substeps(made)
     p = t.given
     p_ce = p.p_cx * t.cos_phi - p.p_cy * t.sin_phi
     p_cf = p.p_cx * t.sin_phi + p.p_cy * t.cos_phi
@@ -151,15 +220,24 @@ def test_momentum_changes_by_the_impulses(seed):
         "left": (r.J * (b.omega_l - a.omega_l) - spins[0] - p.q_l + r.R * p.p_lf) / r.R,
         "right wheel": (r.J * (b.omega_r - a.omega_r) - spins[1] - p.q_r + r.R * p.p_rf) / r.R,
         "castor": (r.J_c * (b.omega_c - a.omega_c) - p.q_c + r.R_c * p.p_cy) / r.R_c,
+        "fork angle": b.psi - a.psi - DT_S * b.s,
+        "angle left": b.angle_l - a.angle_l - DT_S * b.omega_l,
+        "angle right": b.angle_r - a.angle_r - DT_S * b.omega_r,
+        "x": b.x - a.x - DT_S * b.v_x,
+        "y": b.y - a.y - DT_S * b.v_y,
+        "theta": b.theta - a.theta - DT_S * b.w,
     }
     for name, difference in balances.items():
         assert np.abs(difference).max() < 1e-9, name
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_tyres_stick_within_their_circle_or_oppose_their_slip(seed):
-    _, _, floor, made = random_drive(seed)
-    r, t = body(ROBOT), substeps(made)
+def check_tyres(drive: Drive, held_mm_s: float = 1e-8) -> None:
+    """Each tyre holds within its circle, but for its creep, or pulls on it against its slip.
+
+    ``held_mm_s`` is what counts as no slip. Sweeps of a tyre with creep end before that is as small.
+    """
+    floor, robot = drive.floor, drive.robot
+    r, t = body(robot), substeps(drive.run)
     b, p = t.after, t.given
     side = t.new_e - b.w * r.d
     pivot = t.new_e + b.w * r.q
@@ -173,47 +251,54 @@ def test_tyres_stick_within_their_circle_or_oppose_their_slip(seed):
     ]
     impulses = [(p.p_le, p.p_lf), (p.p_re, p.p_rf), (p.p_cx, p.p_cy)]
     speeds = [t.last.slip_l, t.last.slip_r, t.last.slip_c]
-    for slip, impulse, speed, load in zip(slips, impulses, speeds, LOADS, strict=True):
-        circle = curve(ROBOT.tyre, speed) * load * DT_S
+    kept = [p.slip_l, p.slip_r, p.slip_c]
+    grips = floor.grip_l, floor.grip_r, floor.grip_c
+    rims = r.R * t.before.omega_l, r.R * t.before.omega_r, r.R_c * t.before.omega_c
+    for slip, impulse, speed, after, grip, rim, load in zip(
+        slips, impulses, speeds, kept, grips, rims, loads_of(robot), strict=True
+    ):
+        circle = curve(robot.tyre, speed) * load * grip * DT_S
         size, slip_speed = np.hypot(*impulse), np.hypot(*slip)
+        assert slip_speed == pytest.approx(after, abs=1e-9, rel=1e-9)
         assert (size <= circle * (1 + 1e-12)).all()
         sticks = size < circle * (1 - 1e-9)
+        creep = floor.creep * np.abs(rim) / (load * DT_S)
+        held = np.hypot(*(one + creep * given for one, given in zip(slip, impulse, strict=True)))
         # The sweeps stop after their cap in a few substeps in ten thousand.
-        assert np.count_nonzero(slip_speed[sticks] > 1e-8) <= 0.01 * len(sticks)
-        assert slip_speed[sticks].max(initial=0) < 0.01
+        assert np.count_nonzero(held[sticks] > held_mm_s) <= 0.01 * len(sticks)
+        assert held[sticks].max(initial=0) < 0.01
         cross = (slip[0] * impulse[1] - slip[1] * impulse[0])[~sticks] / circle[~sticks]
         assert np.abs(cross).max(initial=0) < 0.01
         assert (slip[0] * impulse[0] + slip[1] * impulse[1])[~sticks].max(initial=0) < 1e-9
 
 
-@pytest.mark.parametrize("seed", SEEDS)
-def test_joints_stick_within_eq_5_or_oppose_their_turning(seed):
-    made = random_drive(seed).run
-    r, t = body(ROBOT), substeps(made)
+def check_joints(drive: Drive) -> None:
+    """Each axle holds within eq. (5) and the resistance to rolling, or both oppose its turning."""
+    robot = drive.robot
+    r, t = body(robot), substeps(drive.run)
     a, b, p = t.before, t.after, t.given
     old = Contact(*(x / DT_S for x in t.last))
-    drive, axle, steering = ROBOT.drive_joint, ROBOT.castor_joint, ROBOT.steering_joint
-    load, load_c = LOADS[0], LOADS[2]
+    drives, axle, steering = robot.drive_joint, robot.castor_joint, robot.steering_joint
+    load, _, load_c = loads_of(robot)
+    resists, there = drive.floor.rolling, float(robot.joint_friction)
 
     def wheel(joint, radius, spin, across, along, load):
         radial = np.hypot(load, along)
-        return joint_torque(joint, radius * spin, across, radial, radius * across)
+        torque = joint_torque(joint, radius * spin, across, radial, radius * across)
+        return there * torque + resists * load * radius
 
+    turning = joint_torque(
+        steering,
+        steering.pin_radius_mm * (a.s - a.w),
+        load_c,
+        np.hypot(old.p_cx, old.p_cy),
+        load_c * r.T,
+    )
     joints = [
-        (p.q_l, b.omega_l, wheel(drive, r.R, a.omega_l, old.p_le, old.p_lf, load)),
-        (p.q_r, b.omega_r, wheel(drive, r.R, a.omega_r, old.p_re, old.p_rf, load)),
+        (p.q_l, b.omega_l, wheel(drives, r.R, a.omega_l, old.p_le, old.p_lf, load)),
+        (p.q_r, b.omega_r, wheel(drives, r.R, a.omega_r, old.p_re, old.p_rf, load)),
         (p.q_c, b.omega_c, wheel(axle, r.R_c, a.omega_c, old.p_cx, old.p_cy, load_c)),
-        (
-            p.q_s,
-            b.s - b.w,
-            joint_torque(
-                steering,
-                steering.pin_radius_mm * (a.s - a.w),
-                load_c,
-                np.hypot(old.p_cx, old.p_cy),
-                load_c * r.T,
-            ),
-        ),
+        (p.q_s, b.s - b.w, there * turning),
     ]
     for impulse, rate, largest in joints:
         cap = largest * DT_S
@@ -221,6 +306,166 @@ def test_joints_stick_within_eq_5_or_oppose_their_turning(seed):
         sticks = np.abs(impulse) < cap * (1 - 1e-9)
         assert not rate[sticks].any()
         assert (impulse * rate)[~sticks].max(initial=0) <= 0
+
+
+@pytest.mark.parametrize("seed", SHORT_SEEDS)
+def test_a_few_substeps_in_any_state_keep_all_laws(seed):
+    drive = short_drive(seed)
+    check_momentum(drive)
+    check_tyres(drive, held_mm_s=1e-4)
+    check_joints(drive)
+
+
+@driver
+def both_ways(
+    bodies: np.ndarray,
+    motions: np.ndarray,
+    contacts: np.ndarray,
+    floors: np.ndarray,
+    pushes: np.ndarray,
+    torques: np.ndarray,
+    holds: np.ndarray,
+    rolled: np.ndarray,
+    slid: np.ndarray,
+) -> None:
+    """Each substep of a run in closed form, and whether that holds, and by sweeps; (field, substep, 1)."""
+    for k in range(torques.shape[0]):
+        robot, floor, push = (
+            read_body(bodies, 0, 0),
+            read_floor(floors, 0, 0),
+            read_push(pushes, 0, 0),
+        )
+        motion, contact = read_motion(motions, k, 0), read_contact(contacts, k, 0)
+        left, right = torques[k, 0], torques[k, 1]
+        holds[k], closed, _ = roll(robot, motion, contact, floor, push, left, right, DT_S)
+        swept, _ = slide(robot, motion, contact, floor, push, left, right, DT_S)
+        write_motion(rolled, k, 0, closed)
+        write_motion(slid, k, 0, swept)
+
+
+@pytest.mark.parametrize("seed", [seed for seed in SHORT_SEEDS if seed % 6])  # those without creep
+def test_the_closed_form_holds_where_all_wheels_roll_and_is_what_sweeps_find(seed):
+    drive = short_drive(seed)
+    made, joints = drive.run, drive.robot.joint_friction
+    resists = joints or drive.floor.rolling > 0.0
+    holds = np.zeros(SHORT_STEPS, dtype=np.bool_)
+    rolled, slid = np.zeros((2, len(Motion._fields), SHORT_STEPS, 1))
+    both_ways(
+        np.array(body(drive.robot)).reshape(-1, 1, 1),
+        np.array(made.motion)[:, :, None],
+        np.array(made.contact)[:, :, None],
+        np.array(drive.floor).reshape(-1, 1, 1),
+        drive.push.reshape(-1, 1, 1),
+        1000.0 * drive.torques_Nmm,
+        holds,
+        rolled,
+        slid,
+    )
+    a, b = Motion(*(x[:-1] for x in made.motion)), Motion(*slid[:, :, 0])
+    slips = np.max([x[1:] for x in made.contact[-3:]], axis=0)
+    axles = [(a.omega_l, b.omega_l), (a.omega_r, b.omega_r), (a.omega_c, b.omega_c)]
+    go_on = [(before * after > 0) | (not resists) for before, after in axles]
+    steers = ((a.s - a.w) * (b.s - b.w) > 0) | (not joints)
+    steering = np.where(a.s == a.w, b.s == b.w, steers)
+    even = np.isclose(made.contact.p_le[1:], made.contact.p_re[1:])  # not if a circle is too small
+    expected = (slips < 1e-6) & np.all(go_on, axis=0) & steering & even
+    assert np.array_equal(holds, expected)
+    velocities = np.s_[Motion._fields.index("v_x") : Motion._fields.index("angle_l")]
+    scale = np.array([300.0, 300.0, 2.0, 2.0, 10.0, 10.0, 20.0])[:, None]
+    difference = np.abs(rolled - slid)[velocities, :, 0] / scale
+    assert difference[:, holds].max(initial=0.0) < 1e-7
+
+
+@driver
+def in_stages(
+    bodies: np.ndarray,
+    motions: np.ndarray,
+    floors: np.ndarray,
+    torques: np.ndarray,
+    one_by_one: np.ndarray,
+    at_once: np.ndarray,
+) -> None:
+    """The state after every sweep, (field, sweep, robot), and where the sweeps end, (field, robot, 1)."""
+    for i in range(motions.shape[1]):
+        robot, motion, floor = (
+            read_body(bodies, 0, 0),
+            read_motion(motions, i, 0),
+            read_floor(floors, i, 0),
+        )
+        push = Push(0.0, 0.0, 0.0)
+        frame = substep_frame(
+            robot, motion, NO_MEMORY, floor, push, torques[i, 0], torques[i, 1], DT_S
+        )
+        cos_p, sin_p, free, limits = frame.cos_p, frame.sin_p, frame.free, frame.limits
+        state = begin_sweeps(robot, free, NO_MEMORY, cos_p, sin_p)
+        ended = sweep_on(robot, free, cos_p, sin_p, floor, limits, state, SWEEP_CAP)
+        write_sweep(at_once, i, 0, ended)
+        write_sweep(one_by_one, 0, i, state)
+        for k in range(STAGES):
+            state = sweep_on(robot, free, cos_p, sin_p, floor, limits, state, 1)
+            write_sweep(one_by_one, k + 1, i, state)
+
+
+def speeds_of(robot: RobotParameters, rows: Sweep) -> np.ndarray:
+    """The velocities of a sweep as speeds, mm/s: (velocity, ...)."""
+    r = body(robot)
+    turns = r.h * rows.w, r.T * rows.s
+    spins = r.R * rows.omega_l, r.R * rows.omega_r, r.R_c * rows.omega_c
+    return np.array([rows.v_e, rows.v_f, *turns, *spins])
+
+
+def test_sweeps_end_as_soon_as_no_velocity_changes():
+    rng = np.random.default_rng(3)
+    count = 12
+    starts = [random_start(rng, 10.0 ** rng.uniform(-3, 0)) for _ in range(count)]
+    motions = np.array(starts).T[:, :, None].copy()
+    floors = np.repeat(np.array(FLOOR)[:, None, None], count, axis=1)
+    torques = rng.uniform(-2e4, 2e4, (count, 2))
+    bodies = np.array(body(ROBOT)).reshape(-1, 1, 1)
+    stages = np.zeros((len(Sweep._fields), STAGES + 1, count))
+    ends = np.zeros((len(Sweep._fields), count, 1))
+    in_stages(bodies, motions, floors, torques, stages, ends)
+    speeds = speeds_of(ROBOT, Sweep(*stages))
+    settled = np.abs(np.diff(speeds, axis=1)).max(axis=0) < SWEEP_TOLERANCE_MM_S
+    assert settled.any(axis=0).all()
+    needed = settled.argmax(axis=0) + 1
+    assert needed.max() > 10
+    assert np.array_equal(ends[:, :, 0], stages[:, needed, np.arange(count)])
+
+
+@driver
+def all_changes(bodies: np.ndarray, rows: np.ndarray, changes: np.ndarray) -> None:
+    """The change from each of some sweeps, (field, 1, sweep), to each."""
+    robot = read_body(bodies, 0, 0)
+    for i in range(changes.shape[0]):
+        for j in range(changes.shape[1]):
+            changes[i, j] = change_of(robot, read_sweep(rows, 0, j), read_sweep(rows, 0, i))
+
+
+def test_the_change_by_a_sweep_is_the_largest_speed_of_any_sign():
+    rng = np.random.default_rng(0)
+    count, changes = 40, np.zeros((40, 40))
+    rows = rng.normal(size=(len(Sweep._fields), 1, count))
+    only = rng.integers(Sweep._fields.index("v_e"), Sweep._fields.index("lam_l"), count)
+    rows[only, 0, np.arange(count)] *= 100.0  # so that each velocity is the largest at times
+    all_changes(np.array(body(UNLIKE)).reshape(-1, 1, 1), rows, changes)
+    speeds = speeds_of(UNLIKE, Sweep(*rows[:, 0]))
+    assert changes == pytest.approx(np.abs(speeds[:, :, None] - speeds[:, None]).max(axis=0))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_momentum_changes_by_the_impulses(seed):
+    check_momentum(random_drive(seed))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_tyres_stick_within_their_circle_or_oppose_their_slip(seed):
+    check_tyres(random_drive(seed))
+
+
+@pytest.mark.parametrize("seed", SEEDS)
+def test_joints_stick_within_eq_5_or_oppose_their_turning(seed):
+    check_joints(random_drive(seed))
 
 
 @pytest.mark.parametrize("seed", SEEDS)
@@ -265,7 +510,7 @@ def test_friction_never_adds_energy_to_a_driven_robot(robot, seed):
 
 def coasting(start: Motion, robot: RobotParameters, seconds: float) -> Drive:
     made = run(robot, start, seconds=seconds)
-    return Drive(np.zeros((round(seconds / DT_S), 2)), np.zeros(3), FLOOR, made)
+    return Drive(np.zeros((round(seconds / DT_S), 2)), np.zeros(3), FLOOR, made, robot)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -294,7 +539,7 @@ def test_a_run_repeats_bit_for_bit(seed):
 
 @pytest.mark.parametrize("seed", [0, 1, 2])
 def test_a_run_resumes_from_motion_and_memory_bit_for_bit(seed):
-    torques, push, floor, whole = random_drive(seed)
+    torques, push, floor, whole, _ = random_drive(seed)
     k = 777
     rest = run(
         ROBOT,
@@ -309,7 +554,7 @@ def test_a_run_resumes_from_motion_and_memory_bit_for_bit(seed):
 
 
 def test_the_memory_is_part_of_the_state():
-    torques, push, floor, whole = random_drive(0)
+    torques, push, floor, whole, _ = random_drive(0)
     forgetful = run(
         ROBOT, whole.at(777)[0], seconds=0.1, torques_Nmm=torques[777:877], push=push, floor=floor
     )

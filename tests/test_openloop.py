@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from physics_helpers import ROBOT
+from physics_helpers import DT_S, ROBOT, random_start, run
 from pydantic import ValidationError
 
 import tlf_env
@@ -18,11 +18,13 @@ from tlf_env.physics.openloop import (
     MAX_RAD,
     OpenLoopScenario,
     OpenLoopStart,
+    advance_open_loop,
     initial_rows,
     load_scenarios,
     run_open_loop,
 )
-from tlf_env.physics.parameters import FrictionCurve, RobotParameters
+from tlf_env.physics.parameters import FrictionCurve, RobotParameters, body_array
+from tlf_env.physics.state import Contact
 
 PUSH_OFF = {"torque_l_Nmm": 10.0, "torque_r_Nmm": 10.0}
 RUN: dict[str, Any] = {"duration_s": 1.0, "inputs": [PUSH_OFF]}
@@ -321,3 +323,25 @@ def test_a_scenario_refuses_an_impossible_robot_in_one_line(robot, message):
 def test_parameters_never_change():
     with pytest.raises(ValidationError):
         RobotParameters().mass_kg = 2.0
+
+
+def test_a_start_without_fields_rests_at_the_origin():
+    assert set(OpenLoopStart().model_dump().values()) == {0.0}
+    rows = run_open_loop(
+        scenario(start={}, inputs=[{"from_s": 0.0, "torque_l_Nmm": 0.0, "torque_r_Nmm": 0.0}])
+    )
+    assert not rows[:, 1:].any()
+
+
+def test_the_floor_stands_still_and_has_its_whole_grip():
+    """A robot that slides goes on as on a floor that is given."""
+    start = random_start(np.random.default_rng(0))
+    motions = np.array(start).reshape(-1, 1, 1).copy()
+    contacts = np.zeros((len(Contact._fields), 1, 1))
+    torques = np.tile([9000.0, -4000.0], (20, 1))
+    advance_open_loop(
+        body_array([RobotParameters()]), motions, contacts, torques, np.zeros(3), DT_S
+    )
+    other = run(start=start, seconds=0.02, torques_Nmm=(9.0, -4.0), floor=(0.0, 0.0, 1.0, 1.0, 1.0))
+    assert np.array_equal(motions[:, 0, 0], np.array(other.motion)[:, -1])
+    assert np.array_equal(contacts[:, 0, 0], np.array(other.contact)[:, -1])

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import inspect
 import math
 import pickle
 import re
@@ -21,8 +22,15 @@ import tlf_env
 from baselines import ReferencePolicy
 from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.onboard.estimator import EkfParameters
+from tlf_env.onboard.memory import caller_state, give_caller_state
 from tlf_env.onboard.observer import Message, ObserverParameters, Reference
-from tlf_env.onboard.parts import Estimated, Readings
+from tlf_env.onboard.parts import (
+    Estimated,
+    Readings,
+    checked_covariance,
+    load_part,
+    make_part,
+)
 from tlf_env.onboard.wheel_loop import WheelLoopParameters
 from tlf_env.physics.parameters import RobotParameters
 
@@ -503,3 +511,77 @@ def test_what_the_page_shows_runs(monkeypatch: pytest.MonkeyPatch) -> None:
         env = tlf_env.parallel_env("infinity", **yaml.safe_load(robots))
         assert [robot.mass_kg for robot in env.scenario.robot_models] == [1.6] * 3
         assert np.isfinite(drive(env, 0.2)).all()
+
+
+@pytest.mark.parametrize("scale", [1e-6, 1.0, 1e6])
+def test_a_covariance_is_symmetric_but_for_rounding_at_any_scale(scale):
+    """A millionth of the product of both standard deviations is rounding."""
+    covariance = scale * np.array([[4.0, 1.0, 0.2], [1.0, 9.0, 0.3], [0.2, 0.3, 1.0]])
+    for share, fits in ((0.9e-6, True), (1.1e-6, False)):
+        other = covariance.copy()
+        other[0, 1] += share * scale * 2.0 * 3.0
+        if fits:
+            assert checked_covariance(other, "the estimator") is not None
+        else:
+            with pytest.raises(ValueError, match="a symmetric covariance"):
+                checked_covariance(other, "the estimator")
+
+
+def test_a_method_is_checked_after_one_without_a_signature():
+    class Odd:
+        def __init__(self, robot, period_s):
+            self.reset = {}.update  # of a built-in type: nothing says what it takes
+
+        def update(self):
+            """Takes no readings."""
+
+    with pytest.raises(ValueError, match=r"signature|no signature"):
+        inspect.signature({}.update)
+    with pytest.raises(ValueError, match=r"update\(\) cannot be called as update\(readings\)"):
+        make_part("estimator", "mine:Odd", Odd, RobotParameters(), 0.02)
+
+
+@pytest.mark.parametrize(
+    "value", [np.eye(2), np.diag([1.0, math.nan, 1.0]), "wide", [[1.0, 0.0, True]] * 3, np.eye(4)]
+)
+def test_a_covariance_is_three_by_three_finite_numbers(value):
+    with pytest.raises(ValueError, match=r"must return a covariance of 3 × 3 finite numbers"):
+        checked_covariance(value, "the estimator")
+
+
+def test_a_working_directory_that_could_be_imported_from_still_can_be_afterwards(
+    tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    here = str(Path.cwd())
+    for before in ([*sys.path], [*sys.path, here]):
+        monkeypatch.setattr(sys, "path", [*before])
+        assert load_part("policy", f"{HERE}:PaperEkf", trust=True) is PaperEkf
+        assert sys.path == before
+
+
+class Remembering:
+    """A caller with a hook."""
+
+    def __init__(self):
+        self.value = 0
+
+    def get_state(self):
+        return self.value
+
+    def set_state(self, state):
+        self.value = state
+
+
+def test_a_caller_takes_a_state_with_a_hook_only_if_it_has_one():
+    numbers: dict[str, np.ndarray] = {}
+    one, other = Remembering(), Remembering()
+    one.value = 7
+    tree = caller_state(one, "policy", "policy", numbers, memory=[1, 2])
+    assert give_caller_state(other, tree, "policy", numbers) == [1, 2]
+    assert other.value == 7
+    plain = caller_state(object(), "policy", "policy", numbers)
+    assert give_caller_state(object(), plain, "policy", numbers) is None
+    for caller, state in ((object(), tree), (Remembering(), plain)):
+        with pytest.raises(ValueError, match="the policy does not take its state"):
+            give_caller_state(caller, state, "policy", numbers)

@@ -17,7 +17,9 @@ from tlf_env.engine.layout import Sample
 from tlf_env.onboard.slip_estimator import SlipEkfParameters, for_fixes, slip_ekf_constants
 from tlf_env.onboard.speed_observer import (
     NO_OBSERVER,
+    SpeedObserverState,
     WheelState,
+    observed_speeds,
     observed_wheel,
     speed_observer_row,
 )
@@ -331,6 +333,31 @@ def test_known_torques_cost_no_lag():
     known, unknown = followed(row, angle, rates), followed(row, angle, np.zeros(2000))
     assert known == pytest.approx(speed[1:], abs=1e-9)
     assert np.abs(unknown - speed[1:]).max() > 0.05
+
+
+def test_each_wheel_turns_as_both_torques_on_a_rolling_robot_say():
+    """Newton's and Euler's laws about the axle's midpoint; from an exact start nothing is to be corrected."""
+    rng = np.random.default_rng(0)
+    robot, row = body(ROBOT), speed_observer_row(80.0, body(ROBOT), DT_S)
+    radius, half = ROBOT.wheel_radius_mm, ROBOT.axle_width_mm / 2
+    spin = ROBOT.wheel_inertia_kg_mm2 / radius**2
+    mass = ROBOT.mass_kg + 2 * spin
+    inertia = (
+        ROBOT.body_inertia_kg_mm2 + ROBOT.mass_kg * ROBOT.com_offset_mm**2 + 2 * spin * half**2
+    )
+    assert robot.m == ROBOT.mass_kg
+    state, angles, speeds = SpeedObserverState(*[0.0] * 6), np.zeros(2), np.zeros(2)
+    for left, right in rng.uniform(-5e3, 15e3, (200, 2)):
+        forward = (left + right) / radius / mass
+        turning = half * (right - left) / radius / inertia
+        rates = np.array([forward - half * turning, forward + half * turning]) / radius
+        angles += DT_S * speeds + 0.5 * DT_S**2 * rates
+        speeds += DT_S * rates
+        state = observed_speeds(state, *angles, left, right, row, DT_S)
+    assert np.abs(speeds).min() > 0.5
+    assert (state.angle_l, state.angle_r) == pytest.approx(tuple(angles))
+    assert (state.speed_l, state.speed_r) == pytest.approx(tuple(speeds))
+    assert (state.acceleration_l, state.acceleration_r) == pytest.approx((0.0, 0.0), abs=1e-6)
 
 
 def test_the_model_of_the_observer_is_the_plants():

@@ -7,11 +7,13 @@ import math
 import numpy as np
 import pymunk
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from tlf_env.physics.borders import Borders
+from tlf_env.physics.parameters import convex
 from tlf_env.physics.shapes import PlacedShape, border, placed_link, placed_shape, signed_area
-from tlf_env.physics.world import Capsule, gaps_to_capsule
+from tlf_env.physics.world import Capsule, gaps_to_capsule, placed
 
 HULLS = {
     "circle": np.array([(3.0, 4.0)]),
@@ -78,3 +80,69 @@ def test_a_shape_that_is_nowhere_has_no_place(pose: tuple[float, float, float]) 
     assert placed_shape(pymunk.Circle(body, 5.0), pose) is None
     assert placed_link(rope, (0.0, 0.0, 0.0), pose) is None
     assert placed_link(rope, (0.0, 0.0, 0.0), (2.0, 0.0, 0.0)) is not None
+
+
+@settings(max_examples=40, deadline=None)
+@given(
+    seed=st.integers(0, 10_000),
+    count=st.integers(3, 12),
+    scale=st.floats(1e-3, 1e6),
+    stretch=st.floats(0.05, 1.0),
+)
+def test_corners_on_an_ellipse_are_convex_either_way_round_and_in_no_other_order(
+    seed: int, count: int, scale: float, stretch: float
+) -> None:
+    rng = np.random.default_rng(seed)
+    angles = 2.0 * math.pi * (np.arange(count) + rng.uniform(-0.3, 0.3, count)) / count
+    corners = scale * np.stack([np.cos(angles), stretch * np.sin(angles)], axis=-1)
+    corners = placed(corners, *rng.normal(size=2) * scale, rng.uniform(-3, 3))
+
+    def is_convex(points: np.ndarray) -> bool:
+        return convex(tuple((x, y) for x, y in points.tolist()))
+
+    assert is_convex(corners)
+    assert is_convex(corners[::-1])
+    middles = (corners + np.roll(corners, -1, axis=0)) / 2
+    with_middles = np.stack([corners, middles], axis=1).reshape(-1, 2)  # straight but for rounding
+    assert is_convex(with_middles)
+    if count > 3:
+        exchanged = corners.copy()
+        exchanged[[0, 1]] = corners[[1, 0]]
+        assert not is_convex(exchanged)
+    if count > 5:
+        hollow = corners.copy()
+        hollow[1] = corners.mean(axis=0)
+        assert not is_convex(hollow)
+    if count % 2:
+        assert not is_convex(np.concatenate([corners[::2], corners[1::2]])) or count == 3
+    assert not is_convex(np.concatenate([corners, corners]))  # twice around
+    assert not is_convex(np.repeat(corners[:1], count, axis=0))
+    assert not is_convex(corners[0] + np.outer(np.arange(count), corners[1] - corners[0]))
+
+
+def test_the_area_of_a_triangle_is_half_its_base_times_its_height_as_a_plain_number() -> None:
+    corners = np.array([(1.0, 2.0), (7.0, 2.0), (3.0, 6.0)])
+    assert signed_area(corners) == pytest.approx(12.0)
+    assert signed_area(corners[::-1]) == pytest.approx(-12.0)
+    assert type(signed_area(corners)) is float
+
+
+def test_borders_are_the_capsules_of_their_shapes_at_any_pose() -> None:
+    one, other = pymunk.Body(1.0, 1.0), pymunk.Body(1.0, 1.0)
+    shapes: list[pymunk.Shape] = [
+        pymunk.Circle(one, 5.0, (3.0, 4.0)),
+        pymunk.Poly(other, [(0.0, 0.0), (20.0, 0.0), (0.0, 10.0)], radius=1.5),
+        pymunk.Segment(one, (0.0, 1.0), (7.0, 2.0), 0.5),
+    ]
+    borders = Borders([*shapes, pymunk.Circle(None, 9.0)])  # one of no body is nowhere
+    assert borders.bodies == [one, other]
+    assert borders.body_of.tolist() == [0, 1, 1, 1, 0]
+    poses = [(100.0, -50.0, 0.7), (-300.0, 20.0, -2.1)]
+    rows = borders.capsules(poses)
+    assert rows[:, 4].tolist() == [5.0, 1.5, 1.5, 1.5, 0.5]
+    ends = [np.array([[(3.0, 4.0)] * 2])]
+    corners = np.array(shapes[1].get_vertices())  # type: ignore[attr-defined]
+    ends.append(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
+    ends.append(np.array([[(0.0, 1.0), (7.0, 2.0)]]))
+    for row, end, body in zip(rows, np.concatenate(ends), borders.body_of, strict=True):
+        assert row[:4] == pytest.approx(placed(end, *poses[body]).ravel(), abs=1e-9)

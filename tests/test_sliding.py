@@ -9,7 +9,9 @@ from physics_helpers import DT_S, random_start
 from tlf_env.numerics.compiled import driver
 from tlf_env.numerics.memory import table
 from tlf_env.numerics.rows import row_reader, row_writer
+from tlf_env.physics.friction import Circle, disc
 from tlf_env.physics.parameters import Body, RobotParameters, body
+from tlf_env.physics.sliding import TYRE, found_of, set_circle, solve_tyres
 from tlf_env.physics.state import Contact, Floor, Motion, Push
 from tlf_env.physics.vehicle import (
     SLIDE_COLUMNS,
@@ -24,6 +26,7 @@ body_of, motion_of, contact_of, floor_of = (
     row_reader(row, 0) for row in (Body, Motion, Contact, Floor)
 )
 set_motion, set_contact = row_writer(Motion, 0), row_writer(Contact, 0)
+circle_at = row_reader(Circle, 0)
 STEPS = 40
 
 
@@ -116,3 +119,61 @@ def test_side_by_side_gives_the_bits_of_one_by_one(seed):
             assert got.tobytes() == wanted.tobytes()
     assert (one[0] == motions)[:, ~slides].all()
     assert (one[0] != motions)[4:11, slides].any(axis=0).all() or not scales[slides].all()
+
+
+@driver
+def tyres_alone(circles: np.ndarray, found: np.ndarray) -> None:
+    """The impulse and λ of each circle, (number, circle)."""
+    for i in range(SLIDE_COLUMNS):
+        found[0, i], found[1, i], found[2, i] = disc(
+            circles[0, i], circles[1, i], circles[2, i], circles[3, i], circles[4, i], circles[5, i]
+        )
+
+
+@driver
+def tyres_together(circles: np.ndarray, found: np.ndarray) -> None:
+    """The same for all at once."""
+    t = table(SLIDE_ROWS, SLIDE_COLUMNS)
+    for i in range(SLIDE_COLUMNS):
+        set_circle(t, i, circle_at(circles, i))
+        t[TYRE, i] = 1.0
+    solve_tyres(t)
+    for i in range(SLIDE_COLUMNS):
+        each = found_of(t, i)
+        found[0, i], found[1, i], found[2, i] = each.p_e, each.p_f, each.lam
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_tyres_side_by_side_are_solved_as_one_by_one_also_beside_one_without_an_answer(seed):
+    rng = np.random.default_rng(seed)
+    a, c = 10.0 ** rng.uniform(-3, 0, (2, SLIDE_COLUMNS))
+    between = rng.uniform(-0.99, 0.99, SLIDE_COLUMNS) * np.sqrt(a * c)
+    speeds = rng.normal(size=(2, SLIDE_COLUMNS)) * 10.0 ** rng.uniform(-3, 3, SLIDE_COLUMNS)
+    radius = 10.0 ** rng.uniform(-3, 2, SLIDE_COLUMNS) * (rng.random(SLIDE_COLUMNS) < 0.9)
+    circles = np.array([a, c, between, *speeds, radius])
+    if seed % 4 == 0:
+        circles[3, rng.integers(SLIDE_COLUMNS)] = np.nan
+    alone, together = np.zeros((2, 3, SLIDE_COLUMNS))
+    tyres_alone(circles, alone)
+    tyres_together(circles, together)
+    assert np.array_equal(together, alone, equal_nan=True)
+    assert np.isnan(alone).any() == (seed % 4 == 0)
+
+
+def test_robots_whose_castors_all_turn_get_the_bits_of_one_by_one():
+    rng = np.random.default_rng(0)
+    starts = [random_start(rng)._replace(w=-2.0, s=6.0 + i) for i in range(SLIDE_COLUMNS)]
+    motions = np.array(starts).T.copy()
+    bodies = np.repeat(np.array(body(RobotParameters()))[:, None], SLIDE_COLUMNS, axis=1)
+    contacts = np.zeros((len(Contact._fields), SLIDE_COLUMNS))
+    floors = np.zeros((len(Floor._fields), SLIDE_COLUMNS))
+    floors[2:5] = 1.0
+    torques, slides = np.zeros((2, SLIDE_COLUMNS)), np.ones(SLIDE_COLUMNS, dtype=np.bool_)
+    one, many = (motions.copy(), contacts.copy()), (motions.copy(), contacts.copy())
+    for _ in range(3):
+        alone(bodies, *one, floors, torques, slides)
+        together(bodies, *many, floors, torques, slides)
+        for got, wanted in zip(many, one, strict=True):
+            assert got.tobytes() == wanted.tobytes()
+    turning = one[0][Motion._fields.index("s")] - one[0][Motion._fields.index("w")]
+    assert np.abs(turning).min() > 1.0

@@ -13,10 +13,23 @@ import pytest
 
 import tlf_env
 from tlf_env.physics.parameters import RobotParameters
-from tlf_env.physics.pymunk_plant import THETA, V_X, V_Y, YAW, PymunkPlant, X, Y
+from tlf_env.physics.pymunk_plant import (
+    NO_OBJECTS,
+    OUT_OF_REACH,
+    THETA,
+    V_X,
+    V_Y,
+    WITHIN_REACH,
+    YAW,
+    PymunkPlant,
+    X,
+    Y,
+)
+from tlf_env.physics.space_state import body_row, hold, put_body, take_correction
 from tlf_env.physics.state import Motion
-from tlf_env.physics.world import World, capsule_rows, gap_to_walls
+from tlf_env.physics.world import World, capsule_rows, gap_to_walls, placed
 
+DISC = {"type": "circle", "radius_mm": 80.0}
 WALL = {"points_mm": [[-5000.0, 0.0], [5000.0, 0.0]], "thickness_mm": 0.0}
 STILL = np.zeros(2)
 RECTANGLE = [[-90.0, -120.0], [90.0, -120.0], [90.0, 80.0], [-90.0, 80.0]]
@@ -39,7 +52,10 @@ class Flight:
 
     def fly(self, time_s):
         self.plant.sort(self.motions, 0)
-        for _ in range(round(time_s / self.dt)):
+        self.substeps(round(time_s / self.dt))
+
+    def substeps(self, count):
+        for _ in range(count):
             before = self.motions.copy()
             for place, speed in ((X, V_X), (Y, V_Y), (THETA, YAW)):
                 self.motions[place] += self.dt * self.motions[speed]
@@ -199,6 +215,455 @@ def test_a_thin_box_does_not_leave_a_room_of_lines(dt):
     for _ in range(5):
         flight.fly(5 * dt)
         assert max(map(abs, body.position)) < 500.0
+
+
+def crowd(centre=(6.0, -4.0)):
+    """Robots that fly into a pile of pushed things and a user's own, beside a moving obstacle."""
+    box = {"type": "box", "width_mm": 120.0, "length_mm": 60.0}
+    flight = Flight(
+        {
+            "walls": [WALL],
+            "pushables": [
+                {"shape": box, "x_mm": 0.0, "y_mm": 40.0, "mass_kg": 0.5, "angle_rad": 0.2},
+                {"shape": box, "x_mm": 20.0, "y_mm": 110.0, "mass_kg": 0.4, "damping_per_s": 0.5},
+                {"shape": DISC, "x_mm": -110.0, "y_mm": 60.0, "mass_kg": 0.3},
+            ],
+            "moving": [
+                {
+                    "shape": DISC,
+                    "points_mm": [[-400.0, 250.0], [300.0, 260.0]],
+                    "speed_mm_s": 500.0,
+                    "start_s": 0.3,
+                }
+            ],
+        },
+        [{}, {"outline_polygon_mm": RECTANGLE, "outline_friction": 0.4}],
+    )
+    flight.put(0, 10.0, 330.0, v_x=-20.0, v_y=-600.0, theta=0.4, yaw=0.5)
+    flight.put(1, 400.0, 200.0, v_x=-700.0, v_y=-150.0, theta=1.1, yaw=-1.0)
+    crate, cart = pymunk.Body(0.7, 2500.0), pymunk.Body(body_type=pymunk.Body.KINEMATIC)
+    crate.center_of_gravity = centre
+    crate.position, crate.angle, crate.velocity = (150.0, 70.0), 0.5, (-300.0, 40.0)
+    cart.position, cart.velocity, cart.angular_velocity = (-260.0, 60.0), (300.0, 0.0), 1.5
+    shapes = [pymunk.Poly.create_box(one, (70.0, 70.0)) for one in (crate, cart)]
+    shapes[0].friction = 0.6
+    flight.plant.space(flight.motions, 0).add(crate, cart, *shapes)
+    return flight
+
+
+def control_step(flight, step):
+    """Twenty substeps, and where all bodies then are, as bytes."""
+    flight.plant.sort(flight.motions, step)
+    flight.substeps(20)
+    rows = [body_row(body) for body in flight.plant._space.bodies]
+    return np.array(rows).tobytes() + flight.motions.tobytes()
+
+
+CROWD_STEPS, CROWD_GOES_ON = 30, 5
+
+
+@pytest.fixture(scope="module")
+def crowded():
+    """The course of a crowd, and its motions and states before every step."""
+    quiet, asked = crowd(), crowd()
+    course = [control_step(quiet, step) for step in range(CROWD_STEPS)]
+    moments = []
+    for step in range(CROWD_STEPS):
+        moments.append((asked.motions.copy(), asked.plant.get_state()))
+        assert control_step(asked, step) == course[step]  # it goes on as if it had not been asked
+    assert max(len(state["pairs"]) for _, state in moments) >= 5
+    assert max(np.abs(state["corrections"][:, 2]).max() for _, state in moments) > 0.0
+    return course, moments
+
+
+@pytest.mark.parametrize("first", range(0, CROWD_STEPS - CROWD_GOES_ON, 2))
+def test_a_space_goes_on_from_its_state_to_the_last_bit(first, crowded):
+    course, moments = crowded
+    motions, state = moments[first]
+    for name, (dtype, shape) in crowd().plant.state_layout().items():
+        assert state[name].dtype == dtype, name
+        assert len(state[name].shape) == len(shape), name
+        assert all(b in (None, a) for a, b in zip(state[name].shape, shape, strict=True)), name
+    again = crowd()
+    control_step(again, 0)  # whatever it did before
+    again.plant.check_state(state)
+    again.plant.set_state(state, again.plant._constants)
+    again.motions[:] = motions
+    found = again.plant.get_state()
+    assert all(np.array_equal(found[name], state[name]) for name in state)
+    for step in range(first, first + CROWD_GOES_ON):
+        assert control_step(again, step) == course[step]
+
+
+@pytest.mark.parametrize("moments", [(0, 1, 2), (6, 9), (14, 21)])
+def test_copies_of_a_space_go_on_to_the_last_bit(moments):
+    flight, course, twins = crowd(centre=(0.0, 0.0)), [], []
+    for step in range(moments[-1] + CROWD_GOES_ON):
+        if step in moments:
+            copies = copy.deepcopy(flight), pickle.loads(pickle.dumps(flight))
+            twins += [(step, one) for one in copies]
+        course.append(control_step(flight, step))
+    for first, twin in twins:
+        for step in range(first, first + CROWD_GOES_ON):
+            assert control_step(twin, step) == course[step], (first, step)
+
+
+def test_contacts_that_no_space_has_are_refused(crowded):
+    _, moments = crowded
+    state = max((state for _, state in moments), key=lambda state: len(state["pairs"]))
+    plant, counts = crowd().plant, state["pair_counts"]
+    plant.check_state(state)
+
+    def refused(message, **changed):
+        with pytest.raises(ValueError, match=message):
+            plant.check_state({**state, **changed})
+
+    limits = [len(plant._space.shapes), len(plant._space.shapes), 3, 2, 1 << 32, 5, 2]
+    for column, limit in enumerate(limits):
+        for wrong in (-1, limit):
+            changed = counts.copy()
+            changed[-1, column] = wrong
+            refused("out of range", pair_counts=changed)
+    refused("out of range", pairs=state["pairs"][:-1])
+    touching_itself = counts.copy()
+    touching_itself[0, 1] = touching_itself[0, 0]
+    refused("touches itself", pair_counts=touching_itself)
+    refused("without their contacts", contacts=state["contacts"][:-1])
+    refused("without their contacts", contact_keys=state["contact_keys"][:-1])
+    numbers = state["shape_numbers"].copy()
+    numbers[0] = numbers[1]
+    refused("no number of their own", shape_numbers=numbers)
+    numbers[0] = -1
+    refused("no number of their own", shape_numbers=numbers)
+
+
+def test_what_is_in_a_space_does_not_depend_on_what_has_happened_there(crowded):
+    _, moments = crowded
+    fresh, used = crowd().plant, crowd()
+    control_step(used, 0)
+    used.plant.reset(shapes_by=moments[0][1]["shape_numbers"] + 100)
+    assert used.plant.structure() == fresh.structure()
+    other = crowd().plant
+    next(iter(other.pushable_bodies[0].shapes)).friction = 0.9
+    assert other.structure() != fresh.structure()
+
+
+def overlapping():
+    """Two boxes that overlap and turn, after a step that has seen it."""
+    space = pymunk.Space()
+    bodies = [pymunk.Body(0.5, 400.0), pymunk.Body(0.8, 900.0)]
+    space.add(*bodies, *(pymunk.Poly.create_box(one, (40.0, 30.0)) for one in bodies))
+    bodies[0].center_of_gravity = 3.0, -2.0
+    bodies[0].position, bodies[1].position = (1.0, 2.0), (30.0, 14.0)
+    bodies[0].angle, bodies[1].angle = 0.3, -0.2
+    bodies[0].velocity, bodies[1].angular_velocity = (20.0, -5.0), 0.7
+    space.step(0.01)
+    return space, bodies
+
+
+def test_a_correction_is_what_chipmunk_adds_to_a_velocity_in_the_next_step():
+    space, bodies = overlapping()
+    _, others = overlapping()
+    before = [body_row(body) for body in bodies]
+    corrections = [take_correction(body) for body in others]
+    assert [body_row(body) for body in others] == before  # nothing else is taken
+    assert [tuple(take_correction(body)) for body in others] == [(0.0, 0.0, 0.0)] * 2
+    dt = 0.004
+    space.step(dt)
+    for body, row, correction in zip(bodies, before, corrections, strict=True):
+        assert np.abs(correction).min() > 1e-3
+        x, y, angle, v_x, v_y, turning, *_ = row
+        expected = (
+            x + dt * (v_x + correction.x),
+            y + dt * (v_y + correction.y),
+            angle + dt * (turning + correction.turning),
+        )
+        assert body_row(body)[:3] == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("kind", [pymunk.Body.DYNAMIC, pymunk.Body.KINEMATIC])
+@pytest.mark.parametrize("centre", [(0.0, 0.0), (7.0, -3.0), (1.0, 0.0), (0.0, 1.0)])
+def test_a_body_that_leaves_the_index_and_enters_it_again_is_the_same(kind, centre):
+    space, body = pymunk.Space(), pymunk.Body(2.5, 800.0, kind)
+    space.add(body, pymunk.Circle(body, 20.0))
+    body.center_of_gravity = centre
+    put_body(body, (1234.5, -0.3, 0.7, 11.0, 12.0, -1.3, 0.0, 0.0, 0.0))
+
+    def numbers():
+        return (*body_row(body), *body.center_of_gravity, body.mass, body.moment, body.body_type)
+
+    before = numbers()
+    held = hold(body)
+    held.leave()
+    assert body.body_type == pymunk.Body.STATIC
+    if kind == pymunk.Body.DYNAMIC:  # what is not moved by forces keeps its place
+        body.position = 0.0, 0.0
+    held.enter()
+    assert numbers() == before
+    centre_of_mass = body.local_to_world(body.center_of_gravity)
+    assert before[:2] == pytest.approx(tuple(centre_of_mass), rel=1e-12)
+    row = (5.0, 6.0, -2.0, 7.0, 8.0, 9.0, 10.0, 11.0, 12.0)
+    put_body(body, row)
+    assert body_row(body) == row
+    assert tuple(body.center_of_gravity) == centre
+
+
+def test_a_reset_takes_away_forces():
+    flight = crowd()
+    bodies = flight.plant._space.bodies
+    for body in bodies:
+        body.force, body.torque = (5.0, -3.0), 20.0
+    flight.plant.reset()
+    assert all((*body.force, body.torque) == (0.0, 0.0, 0.0) for body in bodies)
+
+
+def test_things_of_a_world_have_its_surfaces_places_and_inertias():
+    triangle = {"type": "polygon", "points_mm": [[-30.0, -20.0], [60.0, -20.0], [-30.0, 40.0]]}
+    box = {"type": "box", "width_mm": 30.0, "length_mm": 70.0}
+    things = [
+        {
+            "shape": shape,
+            "x_mm": 200.0 * i,
+            "y_mm": 50.0,
+            "restitution": 0.1 * i,
+            "friction": 0.2 * i,
+        }
+        for i, shape in enumerate([DISC, box, triangle], start=1)
+    ]
+    wall = WALL | {"restitution": 0.7, "friction": 0.9}
+    flight = Flight(
+        {
+            "walls": [wall],
+            "obstacles": things,
+            "pushables": [one | {"mass_kg": 2.0, "y_mm": 900.0} for one in things],
+        }
+    )
+    flight.put(0, 9000.0, 0.0)
+    fixed = [
+        one for one in flight.plant._space.shapes if one.body is flight.plant._space.static_body
+    ]
+    assert len(fixed) == 4
+    assert [one.friction for one in fixed] == [0.9, 0.2, 0.4, 0.2 * 3]
+    assert [one.elasticity for one in fixed] == [0.7, 0.1, 0.2, 0.1 * 3]
+    pushed = flight.plant.pushable_bodies
+    assert [next(iter(one.shapes)).friction for one in pushed] == [0.2, 0.4, 0.2 * 3]
+    assert pushed[0].moment == pytest.approx(2.0 * 80.0**2 / 2)
+    assert pushed[1].moment == pytest.approx(2.0 * (30.0**2 + 70.0**2) / 12)
+    assert (pushed[2].position.x, pushed[2].position.y) == (600.0, 900.0)
+
+
+def test_a_moving_obstacle_reaches_its_next_place_by_its_velocity():
+    walker = {"shape": DISC, "points_mm": [[100.0, -200.0], [900.0, 400.0]], "speed_mm_s": 250.0}
+    late = walker | {"start_s": 1.5, "angle_rad": 0.3}
+    flight = Flight({"moving": [walker, late]})
+    plant, period_s = flight.plant, 0.02
+    plant.reset(mover_offsets_s=[0.0, 0.8])
+    for step in (0, 7, 60):
+        poses = plant.object_poses(step)
+        plant.space(flight.motions, step)
+        for i, (time_s, angle) in enumerate([(0.0, 0.0), (2.3, 0.3)]):
+            way_mm = 250.0 * (time_s + step * period_s)
+            expected = (100.0 + 0.8 * way_mm, -200.0 + 0.6 * way_mm)
+            assert poses[i] == pytest.approx((*expected, angle))
+            body = plant.moving_bodies[i]
+            assert tuple(body.position) == pytest.approx(expected)
+            assert tuple(body.velocity) == pytest.approx((0.8 * 250.0, 0.6 * 250.0))
+            assert np.hypot(*body.velocity) == pytest.approx(plant._movers[i].speed_mm_s)
+
+
+def test_what_is_in_the_space_is_seen_where_it_is():
+    """Walls of the world and sensors apart; on robots where the robots are now, not where their bodies were."""
+    walker = {"shape": DISC, "points_mm": [[0.0, -500.0], [700.0, -500.0]], "speed_mm_s": 100.0}
+    box = {"type": "box", "width_mm": 30.0, "length_mm": 70.0}
+    pushable = {"shape": box, "x_mm": 300.0, "y_mm": 20.0, "mass_kg": 1.0, "angle_rad": math.pi / 2}
+    world = {"walls": [WALL], "moving": [walker], "pushables": [pushable]}
+    flight = Flight(world, [{}, {}])
+    plant = flight.plant
+    space = plant.space(flight.motions, 0)
+    bars = [pymunk.Segment(body, (0.0, 100.0), (0.0, 150.0), 4.0) for body in plant.bodies]
+    zone = pymunk.Circle(space.static_body, 60.0, (900.0, 900.0))
+    zone.sensor = True
+    post = pymunk.Circle(space.static_body, 25.0, (-300.0, 80.0))
+    rope = pymunk.PinJoint(plant.bodies[1], space.static_body, (0.0, 10.0), (50.0, 60.0))
+    space.add(*bars, zone, post, rope)
+    flight.put(0, 1000.0, 10.0, theta=math.pi / 2)
+    flight.put(1, -500.0, 0.0)
+    rows, owners = plant.visible(flight.motions, 50)
+    assert sorted(owners.tolist()) == [-1] * 6 + [0, 1]
+    wanted = {
+        0: (900.0, 10.0, 850.0, 10.0, 4.0),
+        1: (-500.0, 100.0, -500.0, 150.0, 4.0),
+    }
+    for robot, bar in wanted.items():
+        assert rows[owners == robot][0] == pytest.approx(bar, abs=1e-9)
+    others = rows[owners == -1]
+    circles = others[(others[:, :2] == others[:, 2:4]).all(axis=1)]
+    assert sorted(circles.tolist()) == [
+        [-300.0, 80.0, -300.0, 80.0, 25.0],
+        [100.0, -500.0, 100.0, -500.0, 80.0],
+    ]
+    sides = others[(others[:, :2] != others[:, 2:4]).any(axis=1)]
+    assert sorted(np.hypot(*(sides[:, 2:4] - sides[:, :2]).T)) == pytest.approx([30, 30, 70, 70])
+    assert sides[:, [0, 2]].mean() == pytest.approx(300.0)
+    assert np.ptp(sides[:, [0, 2]]) == pytest.approx(70.0)
+    seen = {(one.kind, one.corners_mm[0]): one for one in plant.shapes(flight.motions, 50)}
+    assert {kind for kind, _ in seen} == {"fixed", "moving", "loose", "zone", "link"}
+    assert ("zone", (900.0, 900.0)) in seen
+    assert ("fixed", (-300.0, 80.0)) in seen
+    (link,) = [one for one in seen.values() if one.kind == "link"]
+    assert np.array(link.corners_mm) == pytest.approx(np.array([(-500.0, 10.0), (50.0, 60.0)]))
+    places = {corner for kind, corner in seen if kind == "loose"}
+    assert any(np.allclose(corner, (900.0, 10.0)) for corner in places)
+    (walks,) = [one for one in seen.values() if one.kind == "moving"]
+    assert walks.corners_mm[0] == pytest.approx((100.0, -500.0))
+
+
+OUTLINE_MM = RobotParameters().outline_radius_mm
+PERIOD_S = 0.02
+
+
+def with_ball(x=3000.0, speed=0.0, outline=None):
+    """A robot at the origin, and a ball of a user's at a distance along x."""
+    flight = Flight(robots=[outline or {}])
+    ball = pymunk.Body(1.0, 500.0)
+    ball.position, ball.velocity = (x, 0.0), (speed, 0.0)
+    flight.plant.space(flight.motions, 0).add(ball, pymunk.Circle(ball, 20.0))
+    return flight, ball
+
+
+def answer(flight, step=0):
+    return flight.plant.objects(flight.motions, step)
+
+
+def test_objects_are_out_of_reach_as_long_as_none_can_come_close():
+    """At rest they may be forgotten for a time in which nothing can come; moving they have to be moved."""
+    flight, ball = with_ball()
+    assert answer(flight) == NO_OBJECTS
+    until = flight.plant._calm_until
+    assert 0 < until <= round(2.0 / PERIOD_S)
+    ball.position = 2990.0, 0.0
+    assert not flight.plant._is_calm()
+    assert answer(flight) == NO_OBJECTS
+    ball.velocity = 0.0, 50.0
+    assert answer(flight) == OUT_OF_REACH
+    ball.velocity = 0.0, 0.0
+    ball.force = 1.0, 0.0
+    assert answer(flight) == WITHIN_REACH
+    ball.force = 0.0, 0.0
+    flight.plant.bodies[0].force = 1.0, 0.0
+    assert answer(flight) == WITHIN_REACH
+
+
+@pytest.mark.parametrize("outline", [{}, {"outline_polygon_mm": RECTANGLE}])
+@pytest.mark.parametrize("theta", [0.0, 0.9, -2.5])
+@pytest.mark.parametrize("y", [30.0, 1500.0])
+def test_how_long_nothing_can_come_follows_from_the_distance_to_the_outline(outline, theta, y):
+    """Nothing changes its speed by more than 6 m/s² before another look; a margin of 10 mm is kept.
+
+    The outline of a polygon is the circle around the box around it.
+    """
+    robot = RobotParameters(**outline)
+    behind = robot.outline_offset_mm - robot.com_offset_mm
+    counts = set()
+    for x in np.linspace(320.0, 1300.0, 50):
+        flight, ball = with_ball(outline=outline)
+        flight.put(0, 1000.0 + x, y - 400.0, theta=theta)
+        ball.position = 1000.0, y
+        flight.plant._space.reindex_shapes_for_body(ball)
+        place = 1000.0 + x, y - 400.0
+        if outline:
+            corners = np.add(RECTANGLE, (0.0, robot.com_offset_mm))
+            low, high = (side(placed(corners, *place, theta), axis=0) for side in (np.min, np.max))
+            centre, size = (low + high) / 2, math.dist(low, high) / 2
+        else:
+            centre = place[0] + behind * math.sin(theta), place[1] - behind * math.cos(theta)
+            size = robot.outline_radius_mm
+        apart = math.dist(centre, ball.position) - size - 20.0
+        assert answer(flight, 5) == NO_OBJECTS
+        steps = flight.plant._calm_until - 5
+        assert steps == int(min(math.sqrt(2.0 * (apart - 10.0) / 6000.0), 2.0) / PERIOD_S)
+        counts.add(steps)
+    assert len(counts) >= 4
+
+
+def test_robots_and_moving_obstacles_are_no_objects_that_have_to_be_moved():
+    walker = {"shape": DISC, "points_mm": [[5000.0, 0.0], [9000.0, 0.0]], "speed_mm_s": 100.0}
+    flight = Flight({"moving": [walker]})
+    flight.put(0, 0.0, 0.0, v_y=200.0, yaw=0.3)
+    for step in (0, 1):
+        flight.plant.space(flight.motions, step)  # the bodies have the robots' velocities
+        assert answer(flight, step) == NO_OBJECTS
+    assert not flight.plant._rests
+    far = {"shape": DISC, "x_mm": -5000.0, "y_mm": 0.0, "mass_kg": 1.0}
+    flight = Flight({"moving": [walker], "pushables": [far]})
+    assert answer(flight) == OUT_OF_REACH  # it may be pushed by what moves
+
+
+def test_one_pulled_or_moving_body_among_others_is_enough():
+    flight, first = with_ball(x=5000.0)
+    space = flight.plant._space
+    others = [pymunk.Body(1.0, 1.0) for _ in range(2)]
+    for i, body in enumerate(others):
+        body.position = -5000.0, 900.0 * i
+        space.add(body, pymunk.Circle(body, 20.0))
+    assert answer(flight) == NO_OBJECTS
+    others[1].angular_velocity = 0.5
+    assert answer(flight) == OUT_OF_REACH
+    others[1].angular_velocity = 0.0
+    others[0].torque = 2.0
+    assert answer(flight) == WITHIN_REACH
+    others[0].torque = 0.0
+    first.position_func = lambda body, dt: None
+    assert answer(flight) == WITHIN_REACH
+
+
+def test_a_fast_object_is_within_reach_when_it_can_touch_within_a_control_step():
+    for speed in (1000.0, 10_000.0):
+        far = OUTLINE_MM + 20.0 + speed * PERIOD_S + 100.0
+        assert answer(with_ball(x=far, speed=-speed)[0]) == OUT_OF_REACH
+        near = OUTLINE_MM + 20.0 + speed * PERIOD_S - 1.0
+        assert answer(with_ball(x=near, speed=-speed)[0]) == WITHIN_REACH
+
+
+def test_calm_is_kept_in_states_and_copies():
+    flight, ball = with_ball()
+    assert answer(flight) == NO_OBJECTS
+    state = flight.plant.get_state()
+    until, calm = state["calm"].tolist()
+    assert calm == 1
+    assert until == flight.plant._calm_until > 1
+    twin = pickle.loads(pickle.dumps(flight))
+    assert twin.plant._is_calm()
+    other, _ = with_ball(x=2000.0)
+    other.plant.set_state(state, other.plant._constants)
+    assert other.plant._is_calm()
+    ball.position = 2500.0, 0.0
+    assert flight.plant.get_state()["calm"].tolist() == [until, 0]
+    assert not pickle.loads(pickle.dumps(flight)).plant._is_calm()
+
+
+def test_a_step_is_divided_for_the_fastest_body_whatever_comes_before_it():
+    """So that no part of it moves a body by more than a quarter of half its thickness."""
+    flight, ball = with_ball(x=5000.0)
+    still = pymunk.Body(1.0, 1.0)
+    flight.plant._space.add(still, pymunk.Circle(still, 5.0))
+    assert flight.plant._splits(0.001) == 1
+    ball.velocity = 10 * 20.0 / 0.001, 0.0  # ten times half its thickness in a step
+    assert flight.plant._splits(0.001) == 40
+    ball.velocity, ball.angular_velocity = (0.0, 0.0), 10.0 / 0.001
+    assert flight.plant._splits(0.001) == 40
+
+
+def test_pushed_things_that_hardly_move_stand_still():
+    disc = {"shape": DISC, "x_mm": 3000.0, "y_mm": 0.0, "mass_kg": 3.0}
+    flight = Flight({"pushables": [disc]})
+    (body,) = flight.plant.pushable_bodies
+    body.velocity, body.angular_velocity = (1e-7, -1e-7), 1e-7
+    assert answer(flight) == NO_OBJECTS
+    assert (*body.velocity, body.angular_velocity) == (0.0, 0.0, 0.0)
+    body.velocity, body.angular_velocity = (1e-3, 0.0), 1e-7
+    assert answer(flight) == OUT_OF_REACH
+    assert (*body.velocity, body.angular_velocity) == (1e-3, 0.0, 1e-7)
 
 
 def environment(name="infinity", **fields):

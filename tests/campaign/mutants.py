@@ -124,6 +124,7 @@ LAW_FILES = (
     "sensors",
     "kernel",
     "world",
+    "chipmunk",
 )
 PLAIN_FILES = (
     "table_1",
@@ -219,9 +220,8 @@ class _Loop:
 
     def pytest_collectreport(self, report: Any) -> None:
         if report.failed:
-            self.out.write(
-                json.dumps({"outcome": "broken", "error": str(report.longrepr), "children_s": 0})
-            )
+            answer = {"outcome": "broken", "error": str(report.longrepr), "children_s": 0}
+            self.out.write(json.dumps(answer) + "\n")  # a line is sent at once
             os._exit(1)
 
     def pytest_runtestloop(self, session: Any) -> bool:
@@ -401,7 +401,7 @@ def _prepare(mode: str, place: Path, fresh: bool = False, changed_file: str = ""
             numbers.flat[0] += amount
             return old
 
-        def plain(function: Any, **_: Any) -> Any:
+        def plain(function: Any, *_: Any, **__: Any) -> Any:
             function.py_func = function
             return function
 
