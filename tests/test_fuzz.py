@@ -11,30 +11,19 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
+from campaign import fuzz
+from campaign.fuzzing import TARGETS, Target, encoded, restored
+from campaign.fuzzing.checks import finite, refused
+from campaign.fuzzing.parts import robot_bases
+from campaign.fuzzing.results import data_sets, run_files
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from baselines.benchmark.plan import parse_seeds, parse_sweep
 from baselines.data.files import read_rows
-
-sys.path.insert(0, str(Path(__file__).resolve().parent / "campaign"))
-
-import fuzz
-from fuzz_targets import (
-    TARGETS,
-    Target,
-    data_sets,
-    encoded,
-    finite,
-    refused,
-    restored,
-    robot_bases,
-    run_files,
-)
 
 EXAMPLES = 10  # of a target with the share 1
 NEEDS = {"datasets": "pyarrow"}

@@ -32,7 +32,7 @@ from typing import Any, NamedTuple
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
-from fuzz_targets import TARGETS, ViolationError, encoded, restored
+from campaign.fuzzing import TARGETS, ViolationError, encoded, restored
 
 OUT = Path("results/campaign/fuzz")
 CASE_LIMIT_S = 30  # for one case
