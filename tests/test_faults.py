@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import json
 import os
 import resource
@@ -25,6 +26,7 @@ from baselines.runs.folders import SUMMARY, UNFINISHED
 from baselines.runs.jobs import alone_in, claim
 from baselines.runs.jsonl import append_line, read_lines
 from baselines.runs.run import run_policy
+from baselines.runs.stopping import Interrupted, interruptible
 from tlf_env.common import files
 from tlf_env.common.files import atomic
 from tlf_env.task.scenario import load_scenario
@@ -60,6 +62,42 @@ def test_an_interrupt_goes_on_unless_the_part_is_asked_for(call):
     scenario = load_scenario("circle", horizon_s=2.0)
     with pytest.raises(KeyboardInterrupt):
         run_policy(scenario, InterruptedAt(call))
+
+
+class Finalised:
+    """An object in whose last moment Ctrl-C is pressed: Python drops an error that is raised there."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+def free_a_body() -> None:
+    """Press Ctrl-C while pymunk frees a body: its library calls Python there, and drops errors."""
+    import pymunk
+
+    def press(frame, event, arg):
+        if event == "call" and frame.f_code.co_name == "freebody":
+            sys.setprofile(None)
+            signal.raise_signal(signal.SIGINT)
+
+    body = pymunk.Body(1.0, 1.0)
+    del body
+    sys.setprofile(press)
+    gc.collect()  # a body refers to itself
+
+
+@pytest.mark.parametrize("where", [Finalised, free_a_body])
+def test_an_interrupt_where_errors_are_dropped_comes_a_little_later(where, capfd):
+    def go_on() -> None:
+        with interruptible():
+            where()
+            end = time.monotonic() + 5.0
+            while time.monotonic() < end:
+                time.sleep(0.001)
+
+    with pytest.raises(Interrupted):
+        go_on()
+    assert capfd.readouterr().err == ""
 
 
 def test_an_interrupted_episode_is_no_line_of_a_benchmark(tmp_path, monkeypatch):

@@ -14,6 +14,8 @@ from typing import Any
 
 INTERRUPTED, TERMINATED = 130, 143  # exit status after SIGINT and after SIGTERM: 128 + the signal
 
+AGAIN_S = 0.01  # after which a signal is sent again that came where no error can be raised
+
 _terminated: list[int] = []
 
 
@@ -29,10 +31,16 @@ class Interrupted(KeyboardInterrupt):
 def interruptible() -> Iterator[None]:
     """Let SIGTERM end a command as Ctrl-C does: either raises :class:`Interrupted`.
 
-    A handler other than Python's own is left alone, and so is a signal that is ignored.
+    A handler other than Python's own is left alone, and so is a signal that is ignored. In a call whose errors
+    Python drops the signal is put off.
     """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        if drops_errors(frame):
+            again = threading.Timer(AGAIN_S, os.kill, (os.getpid(), number))
+            again.daemon = True
+            again.start()
+            return
         if number == signal.SIGTERM:
             _terminated.append(number)
         raise Interrupted
@@ -50,6 +58,19 @@ def interruptible() -> Iterator[None]:
     finally:
         for number, how in taken.items():
             signal.signal(number, how)
+
+
+def drops_errors(frame: FrameType | None) -> bool:
+    """Whether an error that is raised in a frame may be dropped: in a finaliser, and in pymunk.
+
+    pymunk's library calls Python to free a body, for example, whenever the garbage collector runs.
+    """
+    while frame is not None:
+        module = str(frame.f_globals.get("__name__"))
+        if frame.f_code.co_name == "__del__" or module.partition(".")[0] == "pymunk":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def stopped_status() -> int:
