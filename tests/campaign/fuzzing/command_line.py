@@ -26,7 +26,6 @@ from campaign.fuzzing.scenarios import SHORT, described, plain
 from hypothesis import strategies as st
 
 from baselines import cli, console
-from tlf_env.common.presets import yaml_text
 
 
 @target(
@@ -181,7 +180,7 @@ IMPORTED = (
     "baselines.benchmark.check", "baselines.live.play", "baselines.pages.replay", "baselines.paper.report",
     "baselines.runs.figures", "baselines.runs.video", "baselines.speed.speed", "baselines.tuning.search",
 )  # fmt: skip
-CUT_S = 0.3  # a command that still runs gets a SIGINT: Ctrl-C
+CUT_S = 0.12  # a command that still runs gets a SIGINT: Ctrl-C
 WRONG = st.sampled_from(
     [
         *("nan", "inf", "-1", "", "x", "1e999", "a:b", "../..", "[", "0.5", "1,,2", "=", "é", "-", "--"),
@@ -255,7 +254,7 @@ def with_files(folder: Path) -> None:
     """Write the files that the words of a case name."""
     (folder / "log.csv").write_bytes(LOGS[0])
     (folder / "open.json").write_text(json.dumps(TORQUES[0]))
-    (folder / "own.yaml").write_text(yaml_text({"slip": {"delta_1_mm_s": 20.0}}))
+    (folder / "own.yaml").write_text("slip: {delta_1_mm_s: 20.0}\n")
 
 
 def started(words: list[str], cut_s: float = CUT_S) -> Outcome:
@@ -333,33 +332,41 @@ def ran(words: list[str]) -> None:
     except Exception as error:
         try:
             checked(words, in_process(words))
-        except subprocess.TimeoutExpired:
-            return
         except ViolationError as confirmed:
             raise confirmed from error
 
 
 def in_process(words: list[str]) -> Outcome:
-    """Run a command in a process of its own, to its end.
+    """Run a command in a process of its own, which is interrupted after some seconds.
 
     Raises
     ------
-    subprocess.TimeoutExpired
-        if that takes long.
+    ViolationError
+        if it does not stop then.
     """
     with working_folder() as folder, _environment():
         with_files(folder)
-        done = subprocess.run(
+        process = subprocess.Popen(
             [sys.executable, "-m", "baselines", *words],
             stdin=subprocess.DEVNULL,
-            capture_output=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.PIPE,
             encoding="utf-8",
             errors="replace",
-            timeout=20,
-            check=False,
+            preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
         )
+        try:
+            out, err = process.communicate(timeout=5)
+        except subprocess.TimeoutExpired:
+            process.send_signal(signal.SIGINT)
+            try:
+                out, err = process.communicate(timeout=20)
+            except subprocess.TimeoutExpired as late:
+                raise ViolationError("it does not stop", shlex.join(words)) from late
+        finally:
+            process.kill()
         left = [path.name for path in folder.rglob(".*")]
-    return Outcome(done.returncode, done.stdout, done.stderr, left)
+    return Outcome(process.returncode, out, err, left)
 
 
 def checked(words: list[str], found: Outcome) -> None:
