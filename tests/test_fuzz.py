@@ -159,6 +159,20 @@ def test_a_campaign_counts_and_goes_on(tmp_path, monkeypatch):
     assert json.loads((tmp_path / "fuzz.json").read_text()) == counts
 
 
+def test_the_table_has_a_row_for_each_kind():
+    counts = {
+        "paths": {"cases": 3, "findings": [1]},
+        "open_loops": {"cases": 4, "findings": []},
+        "plans": {"cases": 5, "findings": []},
+    }
+    guided = {"paths": {"cases": 60, "status": 0}, "option_texts": {"cases": 70, "status": 77}}
+    assert fuzz.table(counts, guided)[2:] == [
+        "| Files of paths and of torques | 7 | 60 | 1 |",
+        "| Plans, trainings, searches, knobs, and the texts of their options | 5 | 70 | 1 |",
+        "| **all** | 12 | 130 | 2 |",
+    ]
+
+
 def test_cases_come_back_from_their_files():
     case = {"a": [b"\xff\x00", math.inf, 10**40, None, {"b": "\ud800"}], "c": -0.0}
     assert restored(json.loads(json.dumps(encoded(case)))) == case

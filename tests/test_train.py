@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from campaign.jobs import TRAINING
 from safetensors.numpy import load_file
 
 from baselines import load_policy
@@ -19,23 +20,12 @@ from tlf_env.common.presets import presets_folder
 
 SHORT = {"horizon_s": 2.0, "time_gap_s": 1.0, "preview_s": [0.5]}
 CONFIG = {
-    "algorithm": "PPO",
+    **TRAINING,
     "robot_steps": 600,
-    "formations": 4,
-    "scenario": {"action": "residual", "residual_base": "tuned", "estimator": "ekf-slip", **SHORT},
     "tasks": {"infinity": {}, "flower": {"robots": 3, "horizon_s": 3.0}},
     "disturbances": {"nominal": 1, "slip": 2, "combined-hard": 1},
     "levels": [0.5, 1.0],
-    "network": {"hidden": [16]},
-    "settings": {"n_steps": 10, "batch_size": 40, "n_epochs": 2, "learning_rate": 0.01},
     "final_learning_rate_share": 0.1,
-    "checkpoint_every": 240,
-    "evaluation": {
-        "every": 360,
-        "seeds": [10_000, 10_002],
-        "disturbances": ["slip"],
-        "horizon_s": 2.0,
-    },
 }
 WITH_A_BUFFER = {
     "robot_steps": 2400,
