@@ -9,7 +9,8 @@ that the last two are found, too. Each finding is kept as a file, its case as sm
     python tests/campaign/fuzz.py --targets actions,snapshots --cases 10000
     python tests/campaign/fuzz.py --replay results/campaign/fuzz/NAME.json
 
-The counts of each target are in fuzz.json, and ``--table`` shows them with those of fuzz_parsers.py. Ctrl-C ends the campaign; what was counted is kept.
+The counts of each target are in fuzz.json; ``--table`` shows them, with those of fuzz_parsers.py. Ctrl-C ends
+the campaign; what was counted is kept.
 """
 
 from __future__ import annotations
