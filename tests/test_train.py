@@ -6,6 +6,8 @@ import json
 import re
 import signal
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
@@ -360,6 +362,19 @@ class TestTraining:
             train(load_config(CONFIG), 1, tmp_path)
         with pytest.raises(ValueError, match="holds a training with a different 'config'"):
             train(load_config(CONFIG, robot_steps=900), 0, tmp_path)
+
+    @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="a folder that cannot be written")
+    def test_a_folder_that_cannot_be_written_is_no_matter_of_tensorboard(self, monkeypatch):
+        """Its thread, which writes, would end with a traceback."""
+        pytest.importorskip("tensorboard")
+        from baselines.training.train import tensorboard
+
+        failed = []
+        monkeypatch.setattr(threading, "excepthook", failed.append)
+        with pytest.raises(OSError, match="/proc/self"):
+            tensorboard(Path("/proc/self"))
+        time.sleep(0.2)
+        assert failed == []
 
     @pytest.mark.parametrize("damage", ["cut", "text", "other"])
     def test_a_damaged_checkpoint_is_reported_in_one_line(self, damage, tmp_path):
