@@ -36,9 +36,9 @@ sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 from campaign.fuzzing import TARGETS, ViolationError, encoded, restored
 
 OUT = Path("results/campaign/fuzz")
-CASE_LIMIT_S = 90  # for one case: compiling a driver takes a minute where other work goes on
+CASE_LIMIT_S = 300  # for one case: compiling a driver takes minutes where other work goes on
 STALL_LIMIT_S = (
-    240.0  # without a new case, after which a process is killed: compiled code that hangs
+    600.0  # without a new case, after which a process is killed: compiled code that hangs
 )
 MOST_MEMORY = 3 * 2**30  # bytes that a process may take: more is a finding, a MemoryError
 BATCH = 500  # cases in one process
