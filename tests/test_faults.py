@@ -161,6 +161,25 @@ def test_a_signal_ends_a_command_with_its_status_and_how_to_go_on(
     assert line.endswith("the same command goes on: tlf bench --plan board")
 
 
+def test_an_interrupt_that_becomes_another_error_is_still_one(monkeypatch, capsys):
+    """A module in C whose import is interrupted raises an ImportError."""
+
+    def work(*_, **__):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+            time.sleep(10)
+        except KeyboardInterrupt:
+            raise ImportError("numba._devicearray failed to import") from None
+
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    monkeypatch.setattr(cli, "app", work)
+    try:
+        assert tlf(monkeypatch, "openloop", "torques.json") == 143
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err == "tlf: interrupted\n"
+
+
 WORKERS = """
 import sys, time
 from baselines.runs.jobs import spread

@@ -17,6 +17,7 @@ INTERRUPTED, TERMINATED = 130, 143  # exit status after SIGINT and after SIGTERM
 AGAIN_S = 0.01  # after which a signal is sent again that came where no error can be raised
 
 _terminated: list[int] = []
+_interrupted: list[int] = []
 
 
 class Interrupted(KeyboardInterrupt):
@@ -43,9 +44,11 @@ def interruptible() -> Iterator[None]:
             return
         if number == signal.SIGTERM:
             _terminated.append(number)
+        _interrupted.append(number)
         raise Interrupted
 
     _terminated.clear()
+    _interrupted.clear()
     if threading.current_thread() is not threading.main_thread():
         yield
         return
@@ -58,6 +61,17 @@ def interruptible() -> Iterator[None]:
     finally:
         for number, how in taken.items():
             signal.signal(number, how)
+
+
+@contextmanager
+def no_other_error() -> Iterator[None]:
+    """Let an error that an interrupt has become be the interrupt: a module in C has none but an ImportError."""
+    try:
+        yield
+    except Exception as error:
+        if _interrupted:
+            raise Interrupted from error
+        raise
 
 
 def drops_errors(frame: FrameType | None) -> bool:
