@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -47,10 +48,13 @@ class InterruptedAt:
     def __init__(self, call: int) -> None:
         self.left, self.reference = call, ReferencePolicy()
 
+    def press(self) -> None:
+        raise KeyboardInterrupt
+
     def predict(self, rows, state=None, episode_start=None, deterministic=True):
         self.left -= 1
         if not self.left:
-            raise KeyboardInterrupt
+            self.press()
         return self.reference.predict(rows, state, episode_start, deterministic)
 
 
@@ -86,7 +90,13 @@ def free_a_body() -> None:
     gc.collect()  # a body refers to itself
 
 
-@pytest.mark.parametrize("where", [Finalised, free_a_body])
+def in_a_library() -> None:
+    """Press Ctrl-C in a function whose library drops every error, as C can."""
+    with suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("where", [Finalised, free_a_body, in_a_library])
 def test_an_interrupt_where_errors_are_dropped_comes_a_little_later(where, capfd):
     def go_on() -> None:
         with interruptible():
@@ -159,6 +169,38 @@ def test_a_signal_ends_a_command_with_its_status_and_how_to_go_on(
         signal.signal(number, before)
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("the same command goes on: tlf bench --plan board")
+
+
+def test_an_interrupt_does_not_come_to_the_next_command():
+    """Its error is held by the one that ended the command, and forgotten later."""
+    with pytest.raises(KeyboardInterrupt) as held, interruptible():
+        signal.raise_signal(signal.SIGTERM)
+
+    def next_command() -> None:
+        with interruptible():
+            held.value.__del__()
+            time.sleep(0.1)
+
+    next_command()
+
+
+def test_an_interrupt_that_ends_a_run_early_comes_once():
+    """The part of the run that is kept is written without another one."""
+    policy = InterruptedAt(50)
+    policy.press = lambda: signal.raise_signal(signal.SIGINT)
+    scenario = load_scenario("circle", horizon_s=2.0)
+
+    def part() -> bool:
+        with interruptible():
+            record = run_policy(scenario, policy, keep_interrupted=True)
+            time.sleep(0.3)
+            return record.interrupted
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert part()
+    finally:
+        signal.signal(signal.SIGINT, before)
 
 
 def test_an_interrupt_that_becomes_another_error_is_still_one(monkeypatch, capsys):
