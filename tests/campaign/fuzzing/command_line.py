@@ -273,6 +273,9 @@ def started(words: list[str], cut_s: float = CUT_S) -> Outcome:
                     cli.main()
         except SystemExit as ended:
             status = ended.code
+        except KeyboardInterrupt:  # it came after the command had ended
+            status = 130
+            err.write("tlf: interrupted\n")
         finally:
             sys.argv = arguments
             for stream, _ in streams:
