@@ -97,3 +97,12 @@ def test_a_command_under_a_clock_that_jumps_ends_with_the_same_bytes(tmp_path):
     wanted = job.result(tmp_path / "usual" / jobs.OUT)
     jobs.prepare(tmp_path / "jumping", job)
     assert endurance._under_clock(tmp_path / "jumping", job, "jumps back and forth", wanted) == []
+
+
+def test_a_revision_of_git_is_no_difference_but_all_else_is():
+    usual = b'{"git_revision": "' + b"a" * 40 + b'+", "score": 1}'
+    assert jobs.REVISION.sub(b"", usual) == b'{, "score": 1}'
+    assert jobs.REVISION.sub(b"", b'{"git_revision": null, "score": 1}') == b'{, "score": 1}'
+    assert jobs.REVISION.sub(b"", b"git_revision: null\n") == b"\n"
+    row = b'<tr><th scope="row">revision</th><td class="text">' + b"a" * 40 + b"</td></tr>\n<tr>"
+    assert jobs.REVISION.sub(b"", row) == b"<tr>"

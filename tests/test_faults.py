@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import errno
+import gc
 import json
 import os
 import resource
@@ -11,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
@@ -25,6 +27,7 @@ from baselines.runs.folders import SUMMARY, UNFINISHED
 from baselines.runs.jobs import alone_in, claim
 from baselines.runs.jsonl import append_line, read_lines
 from baselines.runs.run import run_policy
+from baselines.runs.stopping import Interrupted, interruptible
 from tlf_env.common import files
 from tlf_env.common.files import atomic
 from tlf_env.task.scenario import load_scenario
@@ -45,10 +48,13 @@ class InterruptedAt:
     def __init__(self, call: int) -> None:
         self.left, self.reference = call, ReferencePolicy()
 
+    def press(self) -> None:
+        raise KeyboardInterrupt
+
     def predict(self, rows, state=None, episode_start=None, deterministic=True):
         self.left -= 1
         if not self.left:
-            raise KeyboardInterrupt
+            self.press()
         return self.reference.predict(rows, state, episode_start, deterministic)
 
 
@@ -60,6 +66,48 @@ def test_an_interrupt_goes_on_unless_the_part_is_asked_for(call):
     scenario = load_scenario("circle", horizon_s=2.0)
     with pytest.raises(KeyboardInterrupt):
         run_policy(scenario, InterruptedAt(call))
+
+
+class Finalised:
+    """An object in whose last moment Ctrl-C is pressed: Python drops an error that is raised there."""
+
+    def __del__(self) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+
+def free_a_body() -> None:
+    """Press Ctrl-C while pymunk frees a body: its library calls Python there, and drops errors."""
+    import pymunk
+
+    def press(frame, event, arg):
+        if event == "call" and frame.f_code.co_name == "freebody":
+            sys.setprofile(None)
+            signal.raise_signal(signal.SIGINT)
+
+    body = pymunk.Body(1.0, 1.0)
+    del body
+    sys.setprofile(press)
+    gc.collect()  # a body refers to itself
+
+
+def in_a_library() -> None:
+    """Press Ctrl-C in a function whose library drops every error, as C can."""
+    with suppress(KeyboardInterrupt):
+        signal.raise_signal(signal.SIGINT)
+
+
+@pytest.mark.parametrize("where", [Finalised, free_a_body, in_a_library])
+def test_an_interrupt_where_errors_are_dropped_comes_a_little_later(where, capfd):
+    def go_on() -> None:
+        with interruptible():
+            where()
+            end = time.monotonic() + 5.0
+            while time.monotonic() < end:
+                time.sleep(0.001)
+
+    with pytest.raises(Interrupted):
+        go_on()
+    assert capfd.readouterr().err == ""
 
 
 def test_an_interrupted_episode_is_no_line_of_a_benchmark(tmp_path, monkeypatch):
@@ -121,6 +169,57 @@ def test_a_signal_ends_a_command_with_its_status_and_how_to_go_on(
         signal.signal(number, before)
     (line,) = capsys.readouterr().err.splitlines()
     assert line.endswith("the same command goes on: tlf bench --plan board")
+
+
+def test_an_interrupt_does_not_come_to_the_next_command():
+    """Its error is held by the one that ended the command, and forgotten later."""
+    with pytest.raises(KeyboardInterrupt) as held, interruptible():
+        signal.raise_signal(signal.SIGTERM)
+
+    def next_command() -> None:
+        with interruptible():
+            held.value.__del__()
+            time.sleep(0.1)
+
+    next_command()
+
+
+def test_an_interrupt_that_ends_a_run_early_comes_once():
+    """The part of the run that is kept is written without another one."""
+    policy = InterruptedAt(50)
+    policy.press = lambda: signal.raise_signal(signal.SIGINT)
+    scenario = load_scenario("circle", horizon_s=2.0)
+
+    def part() -> bool:
+        with interruptible():
+            record = run_policy(scenario, policy, keep_interrupted=True)
+            time.sleep(0.3)
+            return record.interrupted
+
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    try:
+        assert part()
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+def test_an_interrupt_that_becomes_another_error_is_still_one(monkeypatch, capsys):
+    """A module in C whose import is interrupted raises an ImportError."""
+
+    def work(*_, **__):
+        try:
+            signal.raise_signal(signal.SIGTERM)
+            time.sleep(10)
+        except KeyboardInterrupt:
+            raise ImportError("numba._devicearray failed to import") from None
+
+    before = signal.signal(signal.SIGTERM, signal.SIG_DFL)
+    monkeypatch.setattr(cli, "app", work)
+    try:
+        assert tlf(monkeypatch, "openloop", "torques.json") == 143
+    finally:
+        signal.signal(signal.SIGTERM, before)
+    assert capsys.readouterr().err == "tlf: interrupted\n"
 
 
 WORKERS = """

@@ -11,32 +11,21 @@ import os
 import signal
 import sys
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import pytest
+from campaign import fuzz
+from campaign.fuzzing import TARGETS, Target, encoded, restored
+from campaign.fuzzing.checks import finite, refused
+from campaign.fuzzing.parts import robot_bases
+from campaign.fuzzing.results import data_sets, run_files
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from baselines.benchmark.plan import parse_seeds, parse_sweep
 from baselines.data.files import read_rows
 
-sys.path.insert(0, str(Path(__file__).resolve().parent / "campaign"))
-
-import fuzz
-from fuzz_targets import (
-    TARGETS,
-    Target,
-    data_sets,
-    encoded,
-    finite,
-    refused,
-    restored,
-    robot_bases,
-    run_files,
-)
-
-EXAMPLES = 10  # of a target with the share 1
+EXAMPLES, MOST = 10, 20  # of a target with the share 1, and of any
 NEEDS = {"datasets": "pyarrow"}
 
 
@@ -46,7 +35,7 @@ def test_hostile_cases_are_refused_or_valid(name):
         pytest.importorskip(NEEDS[name])
 
     @settings(
-        max_examples=max(2, round(EXAMPLES * TARGETS[name].share)),
+        max_examples=min(max(2, round(EXAMPLES * TARGETS[name].share)), MOST),
         derandomize=True,
         database=None,
         deadline=None,
@@ -168,6 +157,20 @@ def test_a_campaign_counts_and_goes_on(tmp_path, monkeypatch):
     counts = fuzz.campaign(["own"], 30, 2, tmp_path)
     assert counts["own"]["cases"] == 60
     assert json.loads((tmp_path / "fuzz.json").read_text()) == counts
+
+
+def test_the_table_has_a_row_for_each_kind():
+    counts = {
+        "paths": {"cases": 3, "findings": [1]},
+        "open_loops": {"cases": 4, "findings": []},
+        "plans": {"cases": 5, "findings": []},
+    }
+    guided = {"paths": {"cases": 60, "status": 0}, "option_texts": {"cases": 70, "status": 77}}
+    assert fuzz.table(counts, guided)[2:] == [
+        "| Files of paths and of torques | 7 | 60 | 1 |",
+        "| Plans, trainings, searches, knobs, and the texts of their options | 5 | 70 | 1 |",
+        "| **all** | 12 | 130 | 2 |",
+    ]
 
 
 def test_cases_come_back_from_their_files():

@@ -283,6 +283,11 @@ def test_a_key_that_is_held_acts_once_unless_it_is_made_for_it() -> None:
     assert window.session.level == pytest.approx(1.3)
 
 
+def test_a_policy_without_a_name_is_refused() -> None:
+    with pytest.raises(ValueError, match="policy '' is not one of"):
+        Session(short(), "")
+
+
 def test_restart_and_next_seed() -> None:
     window = opened()
     session = window.session

@@ -6,10 +6,13 @@ import json
 import re
 import signal
 import sys
+import threading
+import time
 from pathlib import Path
 
 import pytest
 import yaml
+from campaign.jobs import TRAINING
 from safetensors.numpy import load_file
 
 from baselines import load_policy
@@ -19,23 +22,12 @@ from tlf_env.common.presets import presets_folder
 
 SHORT = {"horizon_s": 2.0, "time_gap_s": 1.0, "preview_s": [0.5]}
 CONFIG = {
-    "algorithm": "PPO",
+    **TRAINING,
     "robot_steps": 600,
-    "formations": 4,
-    "scenario": {"action": "residual", "residual_base": "tuned", "estimator": "ekf-slip", **SHORT},
     "tasks": {"infinity": {}, "flower": {"robots": 3, "horizon_s": 3.0}},
     "disturbances": {"nominal": 1, "slip": 2, "combined-hard": 1},
     "levels": [0.5, 1.0],
-    "network": {"hidden": [16]},
-    "settings": {"n_steps": 10, "batch_size": 40, "n_epochs": 2, "learning_rate": 0.01},
     "final_learning_rate_share": 0.1,
-    "checkpoint_every": 240,
-    "evaluation": {
-        "every": 360,
-        "seeds": [10_000, 10_002],
-        "disturbances": ["slip"],
-        "horizon_s": 2.0,
-    },
 }
 WITH_A_BUFFER = {
     "robot_steps": 2400,
@@ -384,6 +376,19 @@ class TestTraining:
             train(load_config(CONFIG), 1, tmp_path)
         with pytest.raises(ValueError, match="holds a training with a different 'config'"):
             train(load_config(CONFIG, robot_steps=900), 0, tmp_path)
+
+    @pytest.mark.skipif(not Path("/proc/self").is_dir(), reason="a folder that cannot be written")
+    def test_a_folder_that_cannot_be_written_is_no_matter_of_tensorboard(self, monkeypatch):
+        """Its thread, which writes, would end with a traceback."""
+        pytest.importorskip("tensorboard")
+        from baselines.training.train import tensorboard
+
+        failed = []
+        monkeypatch.setattr(threading, "excepthook", failed.append)
+        with pytest.raises(OSError, match="/proc/self"):
+            tensorboard(Path("/proc/self"))
+        time.sleep(0.2)
+        assert failed == []
 
     @pytest.mark.parametrize("damage", ["cut", "text", "other"])
     def test_a_damaged_checkpoint_is_reported_in_one_line(self, damage, tmp_path):

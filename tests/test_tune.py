@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from campaign.jobs import SEARCH
 from page_tables import numbers_in, rows_of
 
 pytest.importorskip("optuna")
@@ -42,6 +43,7 @@ GAINS = {
 START = {**controller("tuned").model_dump(), "gains": GAINS}
 
 SMALL = {
+    **SEARCH,
     "start": START,
     "search": {
         "gains.k_1_per_s": {"low": 0.2, "high": 2, "log": True},
@@ -50,14 +52,7 @@ SMALL = {
         "ekf_slip.fix_variance_mm2": {"low": 0.05, "high": 20, "log": True},
         "lead_s": {"low": 0, "high": 0.05},
     },
-    "tasks": ["infinity"],
-    "disturbances": ["nominal", "noise"],
-    "seeds": {"first": 0, "count": 2},
-    "choose": {"first": 10_000, "count": 2, "finalists": 2},
-    "horizon_s": 2,
     "trials": 7,
-    "startup_trials": 3,
-    "objective": {"settled_formation_rmse_mm": 0},
 }
 COMMAND = [sys.executable, "-m", "baselines", "tune"]
 

@@ -14,6 +14,7 @@ import tlf_env
 from baselines import cli
 from baselines.commands.run import Wanted, run_command
 from baselines.policies.registry import fit_policy
+from baselines.runs.jobs import alone_in
 from baselines.runs.recorded_film import film_of
 from baselines.runs.run import run_policy
 from baselines.runs.video import FORMATS, Film, check_video, status, write_video
@@ -139,6 +140,19 @@ def test_films_stand_side_by_side_with_captions(tmp_path: Path) -> None:
     )
     assert size_of(path) == (21, 10.0, (642, 240 + 58))
     assert done[-1] == (21, 21)
+
+
+def test_what_killed_writers_have_left_is_removed(tmp_path: Path) -> None:
+    """The folder of one that still writes stays, and so do those of other videos."""
+    names = (".own.gif.abandon1", ".own.gif.inuse_12", ".other.gif.abandon1")
+    for name in names:
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "video.gif").write_bytes(b"GIF")
+    (film,), _ = filmed("reference:linearised", fps=10.0, horizon_s=0.2)
+    with alone_in(tmp_path / names[1]):
+        write_video([film], tmp_path / "own.gif")
+    found = {path.name for path in tmp_path.iterdir()}
+    assert found == {"own.gif", *names[1:]}
 
 
 def test_the_status_says_how_the_robots_do() -> None:

@@ -22,6 +22,7 @@ from baselines.runs.stopping import (
     INTERRUPTED,
     TERMINATED,
     interruptible,
+    no_other_error,
     stopped_status,
 )
 
@@ -47,7 +48,8 @@ def main() -> None:
     print_on_any_terminal()
     with interruptible():
         try:
-            status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
+            with no_other_error():
+                status = app(sys.argv[1:] or ["--help"], standalone_mode=False)
         except TyperException as error:
             fail(error.format_message(), error.exit_code)
         except ValueError as error:

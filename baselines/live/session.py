@@ -83,8 +83,8 @@ class Session:
         ValueError
             in one line, for a name or a value that does not fit.
         """
-        asked = scenario or self.asked
-        name = policy or self.policy
+        asked = self.asked if scenario is None else scenario
+        name = self.policy if policy is None else policy
         number = self.seed if seed is None else checked_seed(seed)
         with without_warnings():
             fitted = fit_policy(name, asked, trust=self._trust)

@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from baselines.runs.signals import SignalTape
+from baselines.runs.stopping import taken
 from tlf_env.engine import readout
 from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.batch import BatchPlant
@@ -188,9 +189,10 @@ def run_policy(
             done = k
             if progress is not None:
                 progress(k, steps)
-    except KeyboardInterrupt:
+    except KeyboardInterrupt as interrupt:
         if not (keep_interrupted and done):
             raise
+        taken(interrupt)
     plain = {name: np.asarray(value).tolist() for name, value in (options or {}).items()} or None
     return replace(
         tape.record(0, scenario, seed, name, done),

@@ -14,7 +14,14 @@ from typing import Any
 
 INTERRUPTED, TERMINATED = 130, 143  # exit status after SIGINT and after SIGTERM: 128 + the signal
 
+AGAIN_S = 0.01  # after which a signal is sent again that came where no error can be raised
+
 _terminated: list[int] = []
+_interrupted: list[int] = []
+_running: list[
+    object
+] = []  # what stands for the command that runs, inside of :func:`interruptible`
+_timers: list[threading.Timer] = []  # that send a signal again
 
 
 class Interrupted(KeyboardInterrupt):
@@ -22,34 +29,93 @@ class Interrupted(KeyboardInterrupt):
 
     Python itself ends a process by SIGINT, whatever status it asks for, once a plain ``KeyboardInterrupt`` has
     passed a call of ``exec``, as many modules have where they are imported.
+
+    A library in C may drop it, as it may drop every error. While a command runs the signal then comes again.
     """
+
+    def __init__(self, number: int | None = None) -> None:
+        super().__init__()
+        self.number = number  # of the signal; None: it does not come again
+        self._command = _running[-1] if _running else None
+
+    def __del__(self) -> None:
+        if self.number is not None and _running and _running[-1] is self._command:
+            _again(self.number)
+
+
+def taken(error: BaseException) -> None:
+    """Note that an interrupt was acted on where it was caught, so that it does not come again."""
+    if isinstance(error, Interrupted):
+        error.number = None
+
+
+def _again(number: int) -> None:
+    """Send this process a signal, a little later."""
+    timer = threading.Timer(AGAIN_S, os.kill, (os.getpid(), number))
+    timer.daemon = True
+    _timers.append(timer)
+    timer.start()
 
 
 @contextmanager
 def interruptible() -> Iterator[None]:
     """Let SIGTERM end a command as Ctrl-C does: either raises :class:`Interrupted`.
 
-    A handler other than Python's own is left alone, and so is a signal that is ignored.
+    A handler other than Python's own is left alone, and so is a signal that is ignored. In a call whose errors
+    Python drops the signal is put off; after one that has dropped it, it comes again.
     """
 
     def interrupt(number: int, frame: FrameType | None) -> None:
+        if drops_errors(frame):
+            _again(number)
+            return
         if number == signal.SIGTERM:
             _terminated.append(number)
-        raise Interrupted
+        _interrupted.append(number)
+        raise Interrupted(number)
 
     _terminated.clear()
+    _interrupted.clear()
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     usual = {signal.SIGINT: signal.default_int_handler, signal.SIGTERM: signal.SIG_DFL}
-    taken = {number: how for number, how in usual.items() if signal.getsignal(number) is how}
+    ours = {number: how for number, how in usual.items() if signal.getsignal(number) is how}
     try:
-        for number in taken:
+        for number in ours:
             signal.signal(number, interrupt)
+        _running.append(object())
         yield
     finally:
-        for number, how in taken.items():
+        _running.clear()
+        while _timers:
+            _timers.pop().cancel()
+        for number, how in ours.items():
             signal.signal(number, how)
+
+
+@contextmanager
+def no_other_error() -> Iterator[None]:
+    """Let an error that an interrupt has become be the interrupt: a module in C has none but an ImportError."""
+    try:
+        yield
+    except Exception as error:
+        if _interrupted:
+            raise Interrupted from error
+        raise
+
+
+def drops_errors(frame: FrameType | None) -> bool:
+    """Whether an error that is raised in a frame may be dropped: in a finaliser, and in pymunk.
+
+    pymunk's library calls Python to free a body, for example, whenever the garbage collector runs.
+    """
+    while frame is not None:
+        module = str(frame.f_globals.get("__name__"))
+        if frame.f_code.co_name == "__del__" or module.partition(".")[0] == "pymunk":
+            return True
+        frame = frame.f_back
+    return False
 
 
 def stopped_status() -> int:

@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import glob
 import math
+import shutil
 import tempfile
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from importlib import import_module
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from baselines.runs.jobs import alone_in
 from tlf_env.common.errors import install_command, suggestion
 from tlf_env.engine.formation import Formation
 from tlf_env.rendering.looks import THEMES, Theme
@@ -130,7 +134,8 @@ def write_video(
 ) -> Path:
     """Write films side by side as one video; a film that ends earlier keeps its last picture.
 
-    Nothing is shown on a display. The file appears under its name only when it is complete.
+    Nothing is shown on a display. The file appears under its name only when it is complete. What a killed
+    writer of the same file has left is removed.
 
     Parameters
     ----------
@@ -182,13 +187,24 @@ def write_video(
 
     write = _writer_of(path.suffix.lower())
     path.parent.mkdir(parents=True, exist_ok=True)
-    with tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder:
+    remove_abandoned(path)
+    with (
+        tempfile.TemporaryDirectory(dir=path.parent, prefix=f".{path.name}.") as folder,
+        alone_in(Path(folder)),
+    ):
         unfinished = Path(folder) / f"video{path.suffix.lower()}"
         samples = range(0, total, max(total // SAMPLES, 1))
         write(unfinished, lambda: frames(samples), frames(range(total), progress), films[0].fps)
         unfinished.chmod(0o644)
         unfinished.replace(path)
     return path
+
+
+def remove_abandoned(path: Path) -> None:
+    """Remove the hidden folders of writers of a video that were killed: those that no process has locked."""
+    for folder in path.parent.glob(f".{glob.escape(path.name)}.????????"):
+        with suppress(ValueError, OSError), alone_in(folder):
+            shutil.rmtree(folder)
 
 
 Writer = Callable[[Path, Callable[[], Iterator[np.ndarray]], Iterator[np.ndarray], float], None]

@@ -15,12 +15,22 @@ from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 
 from baselines.sb3 import FormationVecEnv
+from baselines.training.checkpoint_checks import (
+    BUFFERED,
+    check_counts,
+    check_memory,
+    check_notes,
+    check_parameters,
+    checked_generators,
+    checked_numbers,
+    learns_offline,
+    put_back,
+)
 from baselines.training.history import HistoryVecEnv
 from baselines.training.offline import DataBuffer
 from tlf_env.common.files import atomic
 
 TENSOR = "tensor:"  # marks a tensor's name in the tree of plain values
-BUFFERED = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
 
 
 def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, notes: dict[str, Any]) -> None:
@@ -31,7 +41,8 @@ def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, notes: dict[
     model
         PPO, SAC, RecurrentPPO or TD3BC between two calls of ``learn``.
     notes
-        Any JSON values; :func:`read_checkpoint` returns them.
+        The fields of :class:`~baselines.training.curve.TrainingProgress`; :func:`read_checkpoint` returns
+        them.
     """
     tensors: dict[str, torch.Tensor] = {"torch_generator": torch.get_rng_state()}
     # SB3 shuffles its samples with NumPy's global generator, so a resumed training needs its state.
@@ -47,9 +58,10 @@ def write_checkpoint(path: Path, model: Any, envs: FormationVecEnv, notes: dict[
         "memory": _without_tensors(_memory(model), "memory", tensors),
         "last_ends": list(envs.last_ends),
     }
-    for i, plant in enumerate(envs.plants):
-        for name, array in plant.arrays._asdict().items():
-            tensors[f"plant.{i}.{name}"] = torch.from_numpy(array)
+    if not learns_offline(model):  # else no episode runs
+        for i, plant in enumerate(envs.plants):
+            for name, array in plant.get_state().numbers.items():
+                tensors[f"plant_{i}/{name}"] = torch.from_numpy(array.copy())
     if isinstance(envs, HistoryVecEnv):
         tensors["history"] = torch.from_numpy(envs.memory)
     contiguous = {name: tensor.detach().cpu().contiguous() for name, tensor in tensors.items()}
@@ -64,29 +76,56 @@ def read_checkpoint(path: Path, model: Any, envs: FormationVecEnv) -> dict[str, 
     Raises
     ------
     ValueError
-        if the file is damaged, or belongs to a training with other settings.
+        in one line, if the file is damaged, belongs to a training with other settings, or holds a number
+        that no training has. Then nothing has changed.
     """
     try:
         with safe_open(path, "pt") as file:
             names = list(file.keys())  # safetensors' file cannot be iterated
             tensors = {name: file.get_tensor(name) for name in names}
             plain = json.loads(file.metadata()["state"])
-        model.set_parameters(_with_tensors(plain["parameters"], tensors), exact_match=True)
-        _remember(model, _with_tensors(plain["memory"], tensors))
-        for i, plant in enumerate(envs.plants):
-            for name, array in plant.arrays._asdict().items():
-                array[...] = tensors[f"plant.{i}.{name}"].numpy()
-            plant._seeded[:] = True
+        parameters = _with_tensors(plain["parameters"], tensors)
+        memory = _with_tensors(plain["memory"], tensors)
+        check_parameters(parameters, model)
+        check_memory(memory, model, envs)
+        check_counts(plain, model)
+        check_notes(plain["notes"])
+        generators = checked_generators(plain, tensors)
+        history = None
         if isinstance(envs, HistoryVecEnv):
-            envs.memory[...] = tensors["history"].numpy()
-        envs.last_ends.extend(plain["last_ends"])
-        kind, *rest = plain["numpy_generator"]
-        keys = tensors["numpy_generator"].numpy()
-        np.random.set_state((kind, keys, *rest))  # noqa: NPY002 - SB3 draws from it
-        model.action_space.np_random.bit_generator.state = plain["action_generator"]
-        torch.set_rng_state(tensors["torch_generator"])
-    except (SafetensorError, KeyError, ValueError, TypeError, RuntimeError) as error:
-        raise ValueError(f"cannot resume from {path}: {' '.join(str(error).split())}") from error
+            layout = {"history": (envs.memory.dtype, envs.memory.shape)}
+            history = checked_numbers("", {"history": tensors["history"]}, layout)["history"]
+        used = {"torch_generator", "numpy_generator", "history"}
+        unknown = sorted(
+            name
+            for name in {*tensors} - used
+            if not name.startswith(("model.", "memory.", "plant_"))
+        )
+        if unknown:
+            raise ValueError(f"it has {unknown[0]!r}, which no training has")
+        if not learns_offline(model):
+            put_back(envs.plants, tensors)
+    except (
+        SafetensorError,
+        AttributeError,
+        KeyError,
+        IndexError,
+        ValueError,
+        TypeError,
+        RuntimeError,
+        OverflowError,
+    ) as error:
+        said = f"it has no {error}" if isinstance(error, KeyError) else str(error)
+        raise ValueError(f"cannot resume from {path}: {' '.join(said.split())}") from error
+    model.set_parameters(parameters, exact_match=True)
+    _remember(model, memory)
+    if history is not None:
+        envs.memory[...] = history
+    envs.last_ends.clear()
+    envs.last_ends.extend(plain["last_ends"])
+    np.random.set_state(generators.numpy)  # noqa: NPY002 - SB3 draws from it
+    model.action_space.np_random.bit_generator.state = generators.actions
+    torch.set_rng_state(generators.torch)
     model.num_timesteps, model._n_updates = plain["steps"], plain["updates"]
     notes: dict[str, Any] = plain["notes"]
     return notes
@@ -113,8 +152,8 @@ def _memory(model: Any) -> dict[str, Any]:
 
 def _remember(model: Any, kept: dict[str, Any]) -> None:
     if "last_observations" in kept:
-        model._last_obs = kept["last_observations"].numpy()
-        model._last_episode_starts = kept["starts"].numpy()
+        model._last_obs = kept["last_observations"].numpy().copy()
+        model._last_episode_starts = kept["starts"].numpy().copy()
     for name in model._get_torch_save_params()[1]:
         getattr(model, name).data.copy_(kept[name])  # in place: the optimizer refers to it
     if "lstm" in kept:

@@ -13,6 +13,7 @@ import math
 import time
 from collections.abc import Callable
 from pathlib import Path
+from tempfile import TemporaryFile
 from typing import Any
 
 import torch
@@ -38,6 +39,7 @@ from baselines.training.model import (
 from baselines.training.offline import digest
 from baselines.training.scoring import overall_mm, score_policy
 from baselines.training.sensor_imitation import imitate_with_sensors
+from tlf_env.common.files import naming
 from tlf_env.task.neutral import scenario_hash
 
 POLICY_FILE, CHECKPOINT_FILE, TRAINING_FILE = (
@@ -263,7 +265,15 @@ def check_folder(config: TrainConfig, seed: int, folder: Path) -> None:
 
 
 def tensorboard(folder: Path) -> list[Any]:
-    """TensorBoard's writer, or no writer if TensorBoard is not installed."""
+    """TensorBoard's writer, or no writer if TensorBoard is not installed.
+
+    Raises
+    ------
+    OSError
+        that names the folder, if it cannot be written: TensorBoard's thread would end with a traceback.
+    """
+    with naming(folder):
+        TemporaryFile(dir=folder).close()
     try:
         return [TensorBoardOutputFormat(str(folder))]
     except AssertionError:

@@ -28,6 +28,7 @@ import tracemalloc
 import warnings
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -382,8 +383,8 @@ CLOCKS = {
 }
 
 
-def campaign_clock(outcome: record.Outcome, share: float) -> None:
-    """Small jobs under a clock that is wrong, or jumps back and forth while they run.
+def campaign_clock(outcome: record.Outcome, share: float, only: tuple[str, ...] = ()) -> None:
+    """Small jobs under a clock that is wrong, or jumps back and forth while they run; ``only`` some of them.
 
     Raises
     ------
@@ -393,7 +394,10 @@ def campaign_clock(outcome: record.Outcome, share: float) -> None:
     if not FAKETIME.exists():
         raise FileNotFoundError(f"{FAKETIME}: install the package faketime")
     base = Path(tempfile.mkdtemp(prefix="clock-"))
-    for name in ("run", "bench", "tune"):
+    learning = ("train",) if find_spec("stable_baselines3") else ()  # of the extra train
+    for name in ("run", "bench", "tune", *learning):
+        if only and name not in only:
+            continue
         job = jobs.JOBS[name]
         jobs.prepare(base / name / "usual", job)
         jobs.run_whole(base / name / "usual", job, jobs.Started)
@@ -459,7 +463,7 @@ def main() -> int:
     """Run a campaign; 1 if anything went wrong."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("what", choices=CAMPAIGNS)
-    parser.add_argument("--only", help="of steps and many: kinds, with ; between")
+    parser.add_argument("--only", help="of steps and many kinds, of clock commands; with ; between")
     parser.add_argument("--share", type=float, default=1.0, help="of the full number of cases")
     parser.add_argument("--out", type=Path, help="default: results/campaign/endurance_WHAT.json")
     asked = parser.parse_args()
@@ -472,7 +476,10 @@ def main() -> int:
             for name in set(kinds) - set(asked.only.split(";")):
                 del kinds[name]
     try:
-        CAMPAIGNS[asked.what](outcome, asked.share)
+        if asked.what == "clock" and asked.only:
+            campaign_clock(outcome, asked.share, tuple(asked.only.split(";")))
+        else:
+            CAMPAIGNS[asked.what](outcome, asked.share)
     except KeyboardInterrupt:
         print("interrupted")
     outcome.figures["processor time, s"] = round(time.process_time() - began, 1)

@@ -23,7 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-sys.path.insert(0, str(Path(__file__).resolve().parent))
+sys.path.insert(0, str(Path(__file__).resolve().parents[1]))
 
 OUT = Path("results/campaign/fuzz")
 LONGEST = 2000  # bytes of a case
@@ -55,16 +55,14 @@ NAMES = (
 
 def readers() -> dict[str, tuple[Callable[[bytes], Any], list[bytes]]]:
     """What reads the bytes of a case, and valid files to begin with."""
-    from fuzz_targets import (
-        LOGS,
-        TARGETS,
-        read_log,
-        read_points,
-        refused,
-        scenario_texts,
-        weights,
-        working_folder,
-    )
+    from campaign.fuzzing import TARGETS
+    from campaign.fuzzing.checks import refused, working_folder
+    from campaign.fuzzing.files import LOGS
+    from campaign.fuzzing.policies import weights
+    from campaign.fuzzing.scenarios import scenario_texts
+
+    from baselines.paths.read import read_log
+    from tlf_env.task.waypoints import read_points
 
     def text(data: bytes) -> str:
         return data.decode("utf-8", "replace")

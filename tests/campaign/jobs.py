@@ -35,7 +35,10 @@ CHECKPOINT, STUDY, LINES, SUMMARY = (
 )
 TIMES = ("wall_time_s", "processor_time_s", "evaluated_at_s")
 TENSORBOARD = "events.out.tfevents"
-REVISION = re.compile(rb"[0-9a-f]{40}\+?")  # of git: a commit during a campaign is no difference
+# Of git: a commit during a campaign is no difference, nor that a clock that jumps ends git before it answers.
+REVISION = re.compile(
+    rb'<tr><th scope="row">revision</th>.*\n|"?git_revision"?: ("?[0-9a-f]{40}\+?"?|null)|[0-9a-f]{40}\+?'
+)
 
 TRAINING = {
     "algorithm": "PPO",

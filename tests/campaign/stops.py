@@ -13,8 +13,10 @@ import argparse
 import json
 import os
 import random
+import resource
 import shutil
 import signal
+import statistics
 import sys
 import tempfile
 import time
@@ -40,6 +42,28 @@ class Stopped(NamedTuple):
     ready: str = ""  # a file that is there once the command works; without: after a second
     keeps: Callable[[Path], dict[str, object]] | None = None
     settings: dict[str, str] = {}
+
+
+class Took(NamedTuple):
+    """Times from a signal to the end of a command, s; on a quiet machine the first is about the second."""
+
+    wall_s: float
+    processor_s: float  # of the command and its workers together
+
+
+def processor_s(pid: int) -> float:
+    """Processor time of a process and of its children that have ended."""
+    try:
+        fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    except OSError:
+        return 0.0
+    return sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
+
+
+def ended_processor_s() -> float:
+    """Processor time of all children of this process that have ended, and of theirs."""
+    used = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return used.ru_utime + used.ru_stime
 
 
 LONG = {
@@ -136,9 +160,22 @@ FILES = {
 
 
 def stop(
-    what: Stopped, number: int, group: bool, place: Path, later_s: float, within_s: float
+    what: Stopped,
+    number: int,
+    group: bool,
+    place: Path,
+    later_s: float,
+    within_s: float,
+    took: Callable[[Took], object] = lambda times: None,
 ) -> list[str]:
-    """Start a command, stop it, and look at what is left; what went wrong."""
+    """Start a command, stop it, and look at what is left; what went wrong.
+
+    Parameters
+    ----------
+    took
+        Called with the times from the signal to the end of the command.
+    """
+    others_s = ended_processor_s()
     place.mkdir(parents=True)
     for file, content in FILES.items():
         (place / file).write_text(json.dumps(content), encoding="utf-8")
@@ -155,7 +192,7 @@ def stop(
                 f"it ended before it was stopped, with {started.status()}: {started.said()[-400:]}"
             ]
         before = what.keeps(place / "out") if what.keeps else {}
-        sent = time.monotonic()
+        sent, used_s = time.monotonic(), sum(map(processor_s, started.members()))
         if group:
             for pid in started.members():
                 os.kill(pid, number)
@@ -166,6 +203,7 @@ def stop(
         except TimeoutError as error:
             return [str(error)]
         took_s = time.monotonic() - sent
+        took(Took(took_s, max(0.0, ended_processor_s() - others_s - used_s)))
         said = started.said()
         if took_s > within_s:
             wrong.append(f"it took {took_s:.1f} s to stop")
@@ -205,6 +243,9 @@ def main() -> int:
         "--within-s", type=float, default=2.5, help="time to stop, on a quiet machine"
     )
     parser.add_argument("--rounds", type=int, default=1)
+    parser.add_argument(
+        "--usual", action="store_true", help="only Ctrl-C to the group, and SIGTERM to the command"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--out", type=Path, default=record.RESULTS / "stops.json")
     asked = parser.parse_args()
@@ -214,18 +255,35 @@ def main() -> int:
     outcome = record.Outcome(asked.out, {k: str(v) for k, v in vars(asked).items()})
     rng = random.Random(asked.seed)
     base = Path(tempfile.mkdtemp(prefix="stops-"))
+    took_s: dict[str, list[Took]] = {}
     cases = [
         (name, number, group, turn)
         for turn in range(asked.rounds)
         for name in chosen
         for number in STATUS
         for group in (False, True)
+        if not asked.usual or group is (number == signal.SIGINT)
     ]
     try:
         for i, (name, number, group, _) in enumerate(tqdm(cases, unit="case")):
             kind = f"{name}, {signal.Signals(number).name} to {'its group' if group else 'it'}"
             place = base / str(i)
-            wrong = stop(chosen[name], number, group, place, rng.uniform(0.0, 1.0), asked.within_s)
+            later_s = rng.uniform(0.0, 1.0)
+            took = took_s.setdefault(name, []).append
+            wrong = stop(chosen[name], number, group, place, later_s, asked.within_s, took)
+            outcome.figures |= {
+                f"{one}, s until it has ended": {
+                    f"{which} {field.removesuffix('_s')}": round(of(column), 2)
+                    for field, column in zip(Took._fields, zip(*times, strict=True), strict=True)
+                    for which, of in (("median", statistics.median), ("largest", max))
+                }
+                for one, times in took_s.items()
+                if times
+            }
+            outcome.figures["largest load of the machine"] = max(
+                outcome.figures.get("largest load of the machine", 0.0),
+                round(os.getloadavg()[0], 1),
+            )
             outcome.case(kind, wrong)
             for one in wrong:
                 tqdm.write(f"{kind}: {one}")
