@@ -374,12 +374,15 @@ def test_limits_and_memory_of_a_substep_follow_from_its_state(seed):
     """The joints have the kernel's limits; a tyre's two limits lie on its circle or have the same room."""
     rng = np.random.default_rng(seed)
     plant = ChipmunkPlant([ROBOT])
-    motion = random_start(rng, 10.0 ** rng.uniform(-2, 0))
+    motion = random_start(rng, 10.0 ** rng.uniform(*((-2, 0) if seed % 2 else (-6, -4))))
     motions = np.array(motion)[:, None, None].copy()
     slips = rng.uniform(0, 5, 3)
-    contacts = np.array(NO_MEMORY._replace(slip_l=slips[0], slip_r=slips[1], slip_c=slips[2]))
+    contacts = np.array(
+        NO_MEMORY._replace(p_cx=0.2, p_cy=-0.3, slip_l=slips[0], slip_r=slips[1], slip_c=slips[2])
+    )
     contacts = contacts[:, None, None].copy()
-    floors = np.array(complete((20.0, -10.0, 0.9, 0.8, 0.7)))[:, None, None].copy()
+    belts = (20.0, -10.0) if seed % 2 else (0.0, 0.0)  # without, slow tyres stick
+    floors = np.array(complete((*belts, 0.9, 0.8, 0.7)))[:, None, None].copy()
     plant._limit(motions, contacts, floors, np.zeros((2, 1)), DT_S)
     limits = plant._limits[:, 0]
     robot = body(ROBOT)
@@ -394,12 +397,35 @@ def test_limits_and_memory_of_a_substep_follow_from_its_state(seed):
     load, load_c = robot.load_drive, robot.load_castor
     rims = robot.R * motion.omega_l, robot.R * motion.omega_r, robot.R_c * motion.omega_c
     joints = ROBOT.drive_joint, ROBOT.drive_joint, ROBOT.castor_joint
-    for i, (rim, joint, carried) in enumerate(zip(rims, joints, (load, load, load_c), strict=True)):
-        assert limits[5 + i] == pytest.approx(joint_torque(joint, rim, 0.0, carried, 0.0))
+    across, along = (0.0, 0.0, 0.2 / DT_S), (0.0, 0.0, 0.3 / DT_S)
+    radii = robot.R, robot.R, robot.R_c
+    for i, carried in enumerate((load, load, load_c)):
+        radial = math.hypot(carried, along[i])
+        most = joint_torque(joints[i], rims[i], across[i], radial, across[i] * radii[i])
+        assert limits[5 + i] == pytest.approx(most)
     steering = ROBOT.steering_joint
     turning = steering.pin_radius_mm * (motion.s - motion.w)
-    expected = joint_torque(steering, turning, load_c, 0.0, load_c * robot.T)
+    expected = joint_torque(
+        steering, turning, load_c, math.hypot(0.2, 0.3) / DT_S, load_c * robot.T
+    )
     assert limits[8] == pytest.approx(expected)
+    if seed % 2 == 0:
+        return
+    # The castor slides: its impulse is opposite to the slip that there would be without it, as the last
+    # substep has left it, less what the impulse itself changes.
+    sin, cos = math.sin(motion.psi - motion.theta), math.cos(motion.psi - motion.theta)
+    side = motion.v_x * math.cos(motion.theta) + motion.v_y * math.sin(motion.theta)
+    ahead = motion.v_y * math.cos(motion.theta) - motion.v_x * math.sin(motion.theta)
+    pivot = side + robot.q * motion.w
+    x_c = pivot * cos + ahead * sin + robot.T * motion.s
+    y_c = ahead * cos - pivot * sin - robot.R_c * motion.omega_c
+    w_x = 1 / robot.m + (robot.q * cos) ** 2 / robot.I + robot.T**2 / robot.I_s
+    w_y = 1 / robot.m + (robot.q * sin) ** 2 / robot.I + robot.R_c**2 / robot.J_c
+    lambdas = [
+        (abs(slip) + w * last) / (limit * DT_S) - w
+        for slip, w, last, limit in ((x_c, w_x, 0.2, limits[3]), (y_c, w_y, 0.3, limits[4]))
+    ]
+    assert lambdas[0] == pytest.approx(lambdas[1], rel=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(4))

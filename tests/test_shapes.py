@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from tlf_env.physics.borders import Borders
 from tlf_env.physics.parameters import convex
 from tlf_env.physics.shapes import PlacedShape, border, placed_link, placed_shape, signed_area
-from tlf_env.physics.world import Capsule, gaps_to_capsule, placed
+from tlf_env.physics.world import Capsule, contains_origin, gaps_to_capsule, placed
 
 HULLS = {
     "circle": np.array([(3.0, 4.0)]),
@@ -146,3 +146,16 @@ def test_borders_are_the_capsules_of_their_shapes_at_any_pose() -> None:
     ends.append(np.array([[(0.0, 1.0), (7.0, 2.0)]]))
     for row, end, body in zip(rows, np.concatenate(ends), borders.body_of, strict=True):
         assert row[:4] == pytest.approx(placed(end, *poses[body]).ravel(), abs=1e-9)
+
+
+@pytest.mark.parametrize("scale", [1e-3, 1.0, 1e6])
+def test_a_polygon_contains_the_origin_strictly_inside_at_any_scale(scale: float) -> None:
+    around = scale * np.array([(-1.0, -1.0), (2.0, -1.0), (0.0, 3.0)])
+
+    def contains(points: np.ndarray) -> bool:
+        return contains_origin(tuple((x, y) for x, y in points.tolist()))
+
+    for corners in (around, around[::-1]):
+        assert contains(corners)
+        assert not contains(np.add(corners, (0.0, scale)))  # on its border
+        assert not contains(np.add(corners, (2.5 * scale, 0.0)))

@@ -683,10 +683,20 @@ class PymunkPlant:
             "_sizes": {},
             "_borders": None,
             "_bordered": ([], []),
+            "_placed": [
+                (body, body_row(body))
+                for body in self._space.bodies
+                if body.center_of_gravity != (0.0, 0.0)
+            ],
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        self.__dict__.update(state, _buffer=Buffer())
+        kept = {name: value for name, value in state.items() if name != "_placed"}
+        self.__dict__.update(kept, _buffer=Buffer())
+        # pymunk sets the place of a copied body before its centre of mass, which moves its shapes.
+        for body, row in state["_placed"]:
+            put_body(body, row)
+            self._space.reindex_shapes_for_body(body)
         self._calm = self._stir() if state["_calm"] else ()
 
 
