@@ -70,7 +70,9 @@ def snapshots(case: Any) -> None:
             if of_batch:
                 if (thing.arrays.clock[:, 1] >= thing.arrays.clock[:, 3]).any():
                     break
-                thing.step(np.full(thing.arrays.actions.shape, 0.1))
+                actions = np.full(thing.arrays.actions.shape, 0.1)
+                if refused(lambda: thing.step(actions), RuntimeError) is REFUSED:
+                    break  # a formation of the snapshot has begun no episode
                 finite("observations after a snapshot", thing.observations, OBSERVATION_LIMIT)
                 finite("rewards after a snapshot", thing.rewards)
             elif thing.agents:
