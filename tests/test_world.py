@@ -25,7 +25,7 @@ from tlf_env.physics.pymunk_plant import (
     X,
     Y,
 )
-from tlf_env.physics.space_state import body_row, hold, put_body, take_correction
+from tlf_env.physics.space_state import body_row, hold, put_body, scale_contacts, take_correction
 from tlf_env.physics.state import Motion
 from tlf_env.physics.world import World, capsule_rows, gap_to_walls, placed
 
@@ -1022,3 +1022,21 @@ def test_a_surface_without_effect_is_reported():
     robot = {"outline_restitution": 1.0}
     lines = warnings(tlf_env.load_scenario("infinity", world=wall, robot=robot))
     assert not [line for line in lines if "no effect" in line]
+
+
+@pytest.mark.parametrize("factor", [0.1, 10.0, 100.0])
+def test_a_contact_goes_on_in_steps_of_another_length(factor):
+    """Discs without bounce go on together after they met; Chipmunk alone would throw them apart."""
+    space = pymunk.Space()
+    discs = []
+    for x_mm, speed_mm_s in ((0.0, 100.0), (19.99, 0.0)):
+        body = pymunk.Body(1.0, 100.0)
+        body.position, body.velocity = (x_mm, 0.0), (speed_mm_s, 0.0)
+        space.add(body, pymunk.Circle(body, 10.0))
+        discs.append(body)
+    space.step(1e-3)
+    assert [disc.velocity.x for disc in discs] == pytest.approx([50.0, 50.0])
+    for _ in range(3):
+        scale_contacts(space, 1e-3 * factor)
+        space.step(1e-3 * factor)
+        assert [disc.velocity.x for disc in discs] == pytest.approx([50.0, 50.0], abs=1e-9)

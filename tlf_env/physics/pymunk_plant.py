@@ -42,6 +42,7 @@ from tlf_env.physics.space_state import (
     hold,
     put_body,
     put_contacts,
+    scale_contacts,
     shape_numbers,
     structure_of,
     take_correction,
@@ -437,6 +438,7 @@ class PymunkPlant:
     def _step_once(self, dt: float) -> None:
         for body, force, torque in self._forces:
             body.force, body.torque = force, torque
+        scale_contacts(self._space, dt)
         if self._corrections:
             self._step_after_a_copy(dt)
         else:

@@ -223,6 +223,22 @@ def contacts_of(space: pymunk.Space) -> dict[str, np.ndarray]:
     }
 
 
+def scale_contacts(space: pymunk.Space, dt: float) -> None:
+    """Let the next step of another length than the last one begin with the last forces of the contacts.
+
+    Chipmunk begins with the last impulses, times the ratio of the lengths. But it then counts them without this
+    ratio, and what it takes back leaves energy behind.
+    """
+    last = lib.cpSpaceGetCurrentTimeStep(space._space)
+    if last in (0.0, dt):
+        return
+    for pair in space._get_arbiters():
+        for i in range(pair.count):
+            pair.contacts[i].jnAcc *= dt / last
+            pair.contacts[i].jtAcc *= dt / last
+    lib.cpSpaceSetCurrentTimeStep(space._space, dt)
+
+
 def _xy(vector: Any) -> tuple[float, float]:
     return vector.x, vector.y
 
