@@ -28,6 +28,7 @@ import tlf_env
 from tlf_env.engine import snapshot as module
 from tlf_env.engine.arrays import FROM_SCENARIO
 from tlf_env.engine.formation import Formation
+from tlf_env.engine.layout import in_array
 from tlf_env.engine.snapshot import FORMAT, Snapshot, difference
 from tlf_env.onboard.memory import DEEPEST, NotPlainError, packed, unpacked
 
@@ -1192,6 +1193,19 @@ RANGE = "^the snapshot is damaged: its episode has a step, seed or number out of
         ("arrays/imposed", put(np.inf, 0, 0, 0), "imposed has a number that is not finite$"),
         ("arrays/constants", put(0.0, 0, 0, 0), "robots have constants of another scenario$"),
         ("arrays/constants", put(-1.0, 20, 1, 0), "robots have constants of another scenario$"),
+        *(
+            (
+                "arrays/constants",
+                put(value, in_array(*place), 1, 0),
+                "constants of another scenario$",
+            )
+            for value, place in (
+                (1.9e11, ("gyro_ekf", "slip_weight")),
+                (2.0, ("gyro_ekf", "variance_weight")),
+                (1e3, ("slip_ekf", "mean_weight")),
+                (1e12, ("slip_ekf", "forward")),
+            )
+        ),
         ("space/bodies", put(np.inf, 0, 0), "space/bodies has a number that is not finite$"),
         ("space/bodies", lambda a: a[:-1], r"space/bodies has the shape"),
         ("space/pair_counts", put(99, 0, 0), "damaged: pairs of shapes that are out of range$"),

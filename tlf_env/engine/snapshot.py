@@ -22,8 +22,9 @@ from tlf_env.common.errors import path_text, shown
 from tlf_env.common.files import atomic, parse_json
 from tlf_env.common.models import LARGEST
 from tlf_env.engine.arrays import FROM_SCENARIO, Arrays, Variants
-from tlf_env.engine.layout import BY_NAME, in_array
+from tlf_env.engine.layout import in_array
 from tlf_env.numerics.compiled import simulation_digest
+from tlf_env.onboard.calibration import Belief
 from tlf_env.onboard.memory import packed, unpacked
 from tlf_env.physics.vehicle import Mass
 from tlf_env.task.info import EndReason, TouchedBy
@@ -36,12 +37,17 @@ Layout = Mapping[
 ]  # dtype and shape, None where any length fits
 
 
-# Rows of an episode's constants that its start changes, and those of their fields whose sign may change, too.
+# Constants of an episode that its start changes (a payload, calibration, the period of fixes), those of them
+# whose sign may change, too, and those that are at most 1.
 CHANGED_AT_START = {
     "body": Mass._fields,
-    **{name: BY_NAME[name].fields._fields for name in ("belief", "slip_ekf", "gyro_ekf")},
+    "belief": Belief._fields,
+    "slip_ekf": ("variance_weight", "mean_weight", "threshold"),
+    "gyro_ekf": ("variance_weight",),
 }
 MAY_CHANGE_SIGN = ("d", "q", "w_ef", "outline_ahead")
+WEIGHTS = [in_array("slip_ekf", "variance_weight"), in_array("slip_ekf", "mean_weight")]
+WEIGHTS.append(in_array("gyro_ekf", "variance_weight"))
 
 # Arrays that may hold NaN: no value was set there.
 UNDEFINED = ("imposed", "infos")  # NaN: not imposed, not computed
@@ -434,11 +440,11 @@ def _check_constants(
     here, there = found[:, :, lanes], scenarios[:, :, variants[lanes]]
     same = here == there
     for name, fields in CHANGED_AT_START.items():
-        first = in_array(name)
-        part = slice(first, first + len(fields))
+        part = [in_array(name, field) for field in fields]
         same[part] |= (here[part] > 0.0) | (there[part] <= 0.0)
     for field in MAY_CHANGE_SIGN:
         same[in_array("body", field)] = True
+    same[WEIGHTS] &= here[WEIGHTS] <= 1.0
     if not same.all():
         raise ValueError("the snapshot is damaged: its robots have constants of another scenario")
 
