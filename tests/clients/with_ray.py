@@ -44,7 +44,13 @@ class OfRLlib(rung.Client):
         )
 
     def __init__(self) -> None:
-        ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, ignore_reinit_error=True)
+        ray.init(  # of its own, not a cluster that other processes have started
+            "local",
+            num_cpus=1,
+            include_dashboard=False,
+            log_to_driver=False,
+            ignore_reinit_error=True,
+        )
         torch.set_num_threads(1)
         self.learner = self.config().build_algo()
 
