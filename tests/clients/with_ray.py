@@ -23,6 +23,7 @@ TRAINING = {
     "train_batch_size_per_learner": BATCH,
     "minibatch_size": 128,
     "num_epochs": 8,
+    "lambda_": 0.95,  # RLlib's default is 1: sums of rewards to the end, whose noise throws the policy back
     "vf_clip_param": 1000.0,  # RLlib's default of 10 is for returns of about that size
 }
 
