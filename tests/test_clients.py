@@ -581,10 +581,15 @@ def test_every_training_is_of_the_fixed_version_and_acts_the_same_when_loaded() 
 
 def test_a_folder_of_new_runs_replaces_the_earlier_ones(tmp_path: Path) -> None:
     make_clients = page_maker()
-    changed = {"checks": [], "trainings": []}
+    first, *others = RESULT["ray"][
+        "trainings"
+    ]  # of an interrupted run, which did not reach the others
+    changed = {"checks": [], "trainings": [first | {"steps": 1}]}
     (tmp_path / "ray.json").write_text(json.dumps(changed), encoding="utf-8")
     merged = make_clients.merged(RESULT, tmp_path)
-    assert merged == RESULT | {"ray": changed}
+    assert others
+    assert merged["ray"]["trainings"] == changed["trainings"] + others
+    assert {**merged, "ray": RESULT["ray"]} == RESULT
     (tmp_path / "new.json").write_text("{}", encoding="utf-8")
     with pytest.raises(ValueError, match="new: not in the order of the page"):
         make_clients.merged(RESULT, tmp_path)
