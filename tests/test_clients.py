@@ -554,8 +554,9 @@ def test_the_page_has_the_versions_that_are_installed_for_the_check() -> None:
 
 
 def page_maker() -> Any:
-    """The module that writes the tables; like the other makers of pages, it imports matplotlib."""
-    pytest.importorskip("matplotlib")
+    """The module that writes the tables; like the other makers of pages, it needs two extras of the project."""
+    for name in ("arch", "matplotlib"):  # Tianshou brings matplotlib alone
+        pytest.importorskip(name)
     return importlib.import_module("make_clients")
 
 
