@@ -28,7 +28,7 @@ from tlf_env.task.info import INFO_KEYS
 
 ROOT = Path(__file__).resolve().parent.parent
 sys.path += [str(ROOT / "tests" / "clients"), str(ROOT / "docs" / "figures")]
-rung, wrappers = (importlib.import_module(name) for name in ("rung", "wrappers"))
+each, rung, wrappers = (importlib.import_module(name) for name in ("each", "rung", "wrappers"))
 
 PAGE = (ROOT / "docs" / "compatibility.md").read_text(encoding="utf-8")
 BLOCKS = re.findall(r"^```python\n(.*?)^```", PAGE, re.DOTALL | re.MULTILINE)
@@ -75,6 +75,8 @@ def test_a_wrapper_runs_past_two_ends(
     group: str, name: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("SDL_VIDEODRIVER", "dummy")
+    if REQUIRED and "gymnasium" not in REQUIRED:
+        pytest.skip("the client whose requirements name Gymnasium tries the wrappers")
     needed(group.partition(",")[0].lower())
     if name == "NumpyToTorch":
         needed("torch")
@@ -87,7 +89,7 @@ def test_a_wrapper_runs_past_two_ends(
         needed("pygame")
     if name == "ObstructView":
         needed("cv2")
-    if not wrappers.exists(group, name) and "gymnasium" not in REQUIRED:
+    if not wrappers.exists(group, name) and not REQUIRED:
         pytest.skip(f"this version of {group} has no {name}")
     assert wrappers.outcome(group, name) == ""
 
@@ -552,8 +554,9 @@ def test_the_page_has_the_versions_that_are_installed_for_the_check() -> None:
 
 
 def page_maker() -> Any:
-    """The module that writes the tables; like the other makers of pages, it imports matplotlib."""
-    pytest.importorskip("matplotlib")
+    """The module that writes the tables; like the other makers of pages, it needs two extras of the project."""
+    for name in ("arch", "matplotlib"):  # Tianshou brings matplotlib alone
+        pytest.importorskip(name)
     return importlib.import_module("make_clients")
 
 
@@ -579,13 +582,55 @@ def test_every_training_is_of_the_fixed_version_and_acts_the_same_when_loaded() 
 
 def test_a_folder_of_new_runs_replaces_the_earlier_ones(tmp_path: Path) -> None:
     make_clients = page_maker()
-    changed = {"checks": [], "trainings": []}
+    first, *others = RESULT["ray"][
+        "trainings"
+    ]  # of an interrupted run, which did not reach the others
+    changed = {"checks": [], "trainings": [first | {"steps": 1}]}
     (tmp_path / "ray.json").write_text(json.dumps(changed), encoding="utf-8")
     merged = make_clients.merged(RESULT, tmp_path)
-    assert merged == RESULT | {"ray": changed}
+    assert others
+    assert merged["ray"]["trainings"] == changed["trainings"] + others
+    assert {**merged, "ray": RESULT["ray"]} == RESULT
     (tmp_path / "new.json").write_text("{}", encoding="utf-8")
     with pytest.raises(ValueError, match="new: not in the order of the page"):
         make_clients.merged(RESULT, tmp_path)
+
+
+# The turns of the libraries
+
+
+def parts(**codes: int) -> dict[str, list[list[str]]]:
+    """Commands of each part that end with a code."""
+    return {
+        part: [[sys.executable, "-c", f"raise SystemExit({codes.get(part, 0)})"]]
+        for part in each.PARTS
+    }
+
+
+def test_failed_tests_do_not_keep_a_library_from_its_trainings() -> None:
+    assert each.failed_part(parts(), "ray") == ""
+    assert each.failed_part(parts(tests=1, trainings=2), "ray") == "tests, trainings"
+    assert each.failed_part(parts(install=1, tests=1), "ray") == "install"
+
+
+def test_a_library_that_fails_does_not_keep_the_next_from_its_turn(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(each, "tool", lambda folder: folder / "uv")
+    monkeypatch.setattr(
+        each, "commands", lambda uv, folder, client, *_: parts(tests=int(client == "ray"))
+    )
+    monkeypatch.setattr(sys, "argv", ["each.py", "ray", "skrl"])
+    assert each.main() == 1
+    shown = capsys.readouterr()
+    assert [line for line in shown.out.splitlines() if ":" not in line] == ["== ray", "== skrl"]
+    assert shown.err == "ray failed: tests\n"
+
+
+def test_a_library_without_a_file_of_versions_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(sys, "argv", ["each.py", "rya"])
+    with pytest.raises(SystemExit, match="2"):
+        each.main()
 
 
 # How a training is judged

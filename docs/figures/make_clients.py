@@ -2,7 +2,8 @@
 
 ``make clients`` trains with every library and writes ``results/clients/NAME.json``. ``python
 docs/figures/make_clients.py`` keeps what is found there in ``docs/compatibility.json``, by the name of the
-environment; what is not found stays as it was. The tables are made from that file alone.
+environment; what is not found stays as it was, also a training that an interrupted run did not reach. The
+tables are made from that file alone.
 """
 
 from __future__ import annotations
@@ -31,7 +32,19 @@ ORDER = (
     "ray",
 )
 
-Result = dict[str, dict[str, list[dict[str, Any]]]]
+
+Runs = dict[str, list[dict[str, Any]]]  # the checks and the trainings of a client
+Result = dict[str, Runs]
+
+
+def newest(kept: Runs, found: Runs) -> Runs:
+    """What a client has kept, with what was found in place of the same training, or of all earlier checks."""
+    rows = {
+        (row["algorithm"], row["door"]): row
+        for runs in (kept, found)
+        for row in runs.get("trainings", [])
+    }
+    return {"checks": found["checks"], "trainings": list(rows.values())}
 
 
 def merged(kept: Result, folder: Path) -> Result:
@@ -39,10 +52,10 @@ def merged(kept: Result, folder: Path) -> Result:
     found = {
         path.stem: json.loads(path.read_text(encoding="utf-8")) for path in folder.glob("*.json")
     }
-    everything = kept | found
-    unknown = sorted(set(everything) - set(ORDER))
+    unknown = sorted((set(kept) | set(found)) - set(ORDER))
     if unknown:
         raise ValueError(f"{', '.join(unknown)}: not in the order of the page, {', '.join(ORDER)}")
+    everything = kept | {name: newest(kept.get(name, {}), runs) for name, runs in found.items()}
     return {name: everything[name] for name in ORDER if name in everything}
 
 

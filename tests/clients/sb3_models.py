@@ -20,6 +20,10 @@ OFF_POLICY = {
     "learning_rate": 1e-3,
     "gamma": 0.95,
 }
+# The coefficient of the entropy begins at 1 by default, the size of a reward; an update takes a thousandth off.
+SMALL_ENTROPY = {**OFF_POLICY, "ent_coef": "auto_0.1"}
+# The critics have 1024 neurons in each layer by default, with which an update takes 80 ms on one core.
+CROSSQ = {**SMALL_ENTROPY, "policy_kwargs": {"net_arch": {"pi": [256, 256], "qf": [256, 256]}}}
 FORMATIONS = 16
 
 

@@ -19,12 +19,13 @@ AGENT = "robot_0"
 class WithAgileRL(rung.Client):
     """IPPO in the process of the environment."""
 
-    library, package, algorithm, steps = "AgileRL", "agilerl", "IPPO", 6_144
+    library, package, algorithm, steps = "AgileRL", "agilerl", "IPPO", 20_480
     door = "`parallel_env`"
 
     def __init__(self) -> None:
         torch.set_num_threads(1)
         torch.manual_seed(rung.SEED)
+        np.random.seed(rung.SEED)  # noqa: NPY002 - AgileRL shuffles its batches by this generator
         self.env = PzDummyVecEnv(rung.parallel())
         self.agent = IPPO(
             [self.env.single_observation_space(AGENT)],

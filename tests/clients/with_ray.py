@@ -23,6 +23,7 @@ TRAINING = {
     "train_batch_size_per_learner": BATCH,
     "minibatch_size": 128,
     "num_epochs": 8,
+    "lambda_": 0.95,  # RLlib's default is 1: sums of rewards to the end, whose noise throws the policy back
     "vf_clip_param": 1000.0,  # RLlib's default of 10 is for returns of about that size
 }
 
@@ -44,7 +45,13 @@ class OfRLlib(rung.Client):
         )
 
     def __init__(self) -> None:
-        ray.init(num_cpus=1, include_dashboard=False, log_to_driver=False, ignore_reinit_error=True)
+        ray.init(  # of its own, not a cluster that other processes have started
+            "local",
+            num_cpus=1,
+            include_dashboard=False,
+            log_to_driver=False,
+            ignore_reinit_error=True,
+        )
         torch.set_num_threads(1)
         self.learner = self.config().build_algo()
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import rung
 import sbx
-from sb3_models import OFF_POLICY, ON_POLICY, OfSB3
+from sb3_models import CROSSQ, OFF_POLICY, ON_POLICY, OfSB3
 
 
 class OfSBX(OfSB3):
@@ -28,7 +28,7 @@ class SAC(OfSBX):
 class CrossQ(OfSBX):
     """CrossQ on formations side by side."""
 
-    algorithm, kind, steps, settings = "CrossQ", sbx.CrossQ, 6_000, OFF_POLICY
+    algorithm, kind, steps, settings = "CrossQ", sbx.CrossQ, 12_000, CROSSQ
 
 
 class Alone(OfSBX):

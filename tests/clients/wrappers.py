@@ -164,52 +164,48 @@ def finite(values: Any) -> bool:
     return bool(np.isfinite(np.asarray(values, float)).all())
 
 
+def sampled(env: Any, name: str) -> Callable[[], Any]:
+    """Random actions of an environment of Gymnasium, single or vector; tensors if the wrapper wants them."""
+    env.action_space.seed(0)
+    if name != "NumpyToTorch":
+        return env.action_space.sample
+    import torch
+
+    return lambda: torch.as_tensor(env.action_space.sample())
+
+
+def stepped(env: Any, act: Callable[[], Any]) -> Iterator[tuple[Any, np.ndarray]]:
+    """What is seen in each step, and whether an episode ends in it: one truth, or one for each of a vector."""
+    env.reset(seed=0)
+    for _ in range(STEPS):
+        seen, reward, terminated, truncated, _ = env.step(act())
+        assert finite(seen)
+        assert finite(reward)
+        yield seen, np.asarray(np.logical_or(terminated, truncated))
+    env.close()
+
+
 def drive_single(name: str) -> None:
     """Put a wrapper on ``gymnasium.make``, and step past two ends."""
     kind = SINGLE[name]
     env = kind.put(gymnasium.wrappers, gymnasium.make(ID, **BRIEF | kind.made))
-    env.action_space.seed(0)
-    env.reset(seed=0)
     ended = 0
-    for k in range(STEPS):
-        action = env.action_space.sample()
-        if name == "NumpyToTorch":
-            import torch
-
-            action = torch.as_tensor(action)
-        seen, reward, terminated, truncated, _ = env.step(action)
-        assert finite(seen)
-        assert finite(reward)
-        if name != "NumpyToTorch" and name != "NormalizeObservation":
+    for k, (seen, over) in enumerate(stepped(env, sampled(env, name))):
+        if name not in ("NumpyToTorch", "NormalizeObservation"):
             assert env.observation_space.contains(seen), "an observation is not in its space"
         if kind.made and k == 0 and name != "HumanRendering":
             env.render()
-        if terminated or truncated:
+        if over:
             ended += 1
             if name != "Autoreset":
                 env.reset()
-    env.close()
     assert ended >= 2
 
 
 def drive_vector(name: str) -> None:
-    """Put a wrapper on ``gymnasium.make_vec``, and step past two ends."""
+    """Put a wrapper on ``gymnasium.make_vec``, and step past two ends of each of three."""
     env = VECTOR[name].put(gymnasium.wrappers.vector, gymnasium.make_vec(ID, num_envs=3, **BRIEF))
-    env.action_space.seed(0)
-    env.reset(seed=0)
-    ended = 0
-    for _ in range(STEPS):
-        action = env.action_space.sample()
-        if name == "NumpyToTorch":
-            import torch
-
-            action = torch.as_tensor(action)
-        seen, reward, terminated, truncated, _ = env.step(action)
-        assert finite(seen)
-        assert finite(reward)
-        ended += int((terminated | truncated).sum())
-    env.close()
-    assert ended >= 6
+    assert sum(over.sum() for _, over in stepped(env, sampled(env, name))) >= 6
 
 
 def drive_parallel(name: str) -> None:
@@ -238,15 +234,8 @@ def drive_supersuits_vector(name: str) -> None:
     import supersuit
 
     env = SUPERSUIT_VECTORS[name](supersuit, tlf_env.parallel_env("infinity", **BRIEF))
-    env.reset(seed=0)
-    ended = 0
-    for _ in range(STEPS):
-        action = np.zeros((env.num_envs, 2), np.float32)
-        seen, reward, terminated, truncated, _ = env.step(action)
-        assert finite(seen)
-        assert finite(reward)
-        ended += int(np.logical_or(terminated, truncated).any())
-    assert ended >= 2
+    still = np.zeros((env.num_envs, 2), np.float32)
+    assert sum(over.any() for _, over in stepped(env, lambda: still)) >= 2
 
 
 DRIVES = dict(
