@@ -89,20 +89,10 @@ check-install: ## Build sdist and wheel, and play the first hour in a clean envi
 	mkdir "$$tmp/elsewhere"; cd "$$tmp/elsewhere"; \
 	PATH="$$tmp/venv/bin:$$PATH" sh "$(CURDIR)/tests/first_hour.sh"
 
-# Their requirements exclude each other. CLIENT names the library whose absence is an error, not a skipped test.
-# The trainings' numbers go to results/clients; `python docs/figures/make_clients.py` makes the page's tables of them.
+# Their requirements exclude each other. The trainings' numbers go to results/clients; `python docs/figures/make_clients.py`
+# makes the page's tables of them. RESUME=--resume keeps the trainings that are finished.
 clients: ## Test and train with other libraries, each of CLIENTS in a temporary environment
-	@set -e; \
-	for client in $(CLIENTS); do \
-		echo "== $$client"; \
-		tmp=$$(mktemp -d); trap 'rm -rf "$$tmp"' EXIT; \
-		$(PYTHON) -m venv "$$tmp"; \
-		"$$tmp/bin/python" -m pip install -q --disable-pip-version-check -e . \
-			"torch==$(TORCH)" pytest -r "tests/clients/$$client.txt"; \
-		CLIENT=$$client "$$tmp/bin/python" -m pytest -rs tests/test_clients.py; \
-		SDL_VIDEODRIVER=dummy OMP_NUM_THREADS=1 "$$tmp/bin/python" tests/clients/run.py $$client; \
-		rm -rf "$$tmp"; \
-	done
+	$(PYTHON) tests/clients/each.py --torch $(TORCH) $(RESUME) $(CLIENTS)
 
 check-clients: clients # the earlier name
 
