@@ -101,8 +101,11 @@ def main() -> int:
     if unknown:
         parser.error(f"{', '.join(unknown)}: not one of {', '.join(NAMES)}")
     # A stop deletes the environment, as Ctrl-C does.
-    signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
-    outcomes = turns(given.clients or NAMES, given.torch, ["--resume"] if given.resume else [])
+    before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
+    try:
+        outcomes = turns(given.clients or NAMES, given.torch, ["--resume"] if given.resume else [])
+    finally:
+        signal.signal(signal.SIGTERM, before)
     failed = {client: parts for client, parts in outcomes.items() if parts}
     for client, parts in failed.items():
         print(f"{client} failed: {parts}", file=sys.stderr)
