@@ -142,7 +142,7 @@ def in_process(
     target: str, cases: int, seed: int, known: set[str], folder: Path, queue: Any
 ) -> None:
     """Run a batch in this process, and report into a queue."""
-    sys.stdout = sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - of the process
+    sys.stdout = sys.stderr = Path(os.devnull).open("w", encoding="utf-8")  # noqa: SIM115 - open until the process ends
     used = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (used + MOST_MEMORY, used + MOST_MEMORY))
     current = folder / f".{target}.current.json"

@@ -121,7 +121,8 @@ def _train_result(folder: Path) -> dict[str, Any]:
         elif name.endswith(CHECKPOINT):
             with safe_open(folder / name, "np") as file:
                 state = json.loads(file.metadata()["state"])
-                found[name] = {key: file.get_tensor(key).tobytes() for key in file.keys()}  # noqa: SIM118 - as below
+                names = list(file.keys())  # an opened file of safetensors cannot be iterated itself
+                found[name] = {key: file.get_tensor(key).tobytes() for key in names}
             found[f"{name}, state"] = _without_times(state)
         elif name.endswith("curve.json"):
             found[name] = _without_times(json.loads(content))
@@ -272,7 +273,7 @@ def _read_whole(path: Path) -> None:
                 file[name]
     elif path.suffix == ".safetensors":
         with safe_open(path, "np") as file:
-            for name in file.keys():  # noqa: SIM118 - it cannot be iterated
+            for name in list(file.keys()):  # the file itself cannot be iterated
                 file.get_tensor(name)
     elif path.suffix == ".html":
         _ends_with(path, b"</html>")

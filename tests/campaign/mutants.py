@@ -55,12 +55,13 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from tqdm import tqdm
+
 HERE = Path(__file__).resolve().parent
 ROOT = HERE.parent.parent
 sys.path.insert(0, str(HERE))
 
-import mutation  # noqa: E402
-from tqdm import tqdm  # noqa: E402
+import mutation  # noqa: E402 - of this folder, which is on the path from here on
 
 ROOMS = ("physics", "onboard")
 COMPILING = frozenset({"law", "block", "view", "allocating", "driver"})

@@ -72,7 +72,7 @@ class Client(ABC):
     def loaded(self, folder: Path) -> Act:
         """Save into an empty folder, load from there into a new learner, and return how that acts."""
 
-    def close(self) -> None:  # noqa: B027 - most have nothing to end
+    def close(self) -> None:  # noqa: B027 - not abstract: most learners have nothing to end
         """End what runs in the background."""
 
 
