@@ -178,6 +178,7 @@ read_ekf = array_reader("ekf")
 read_sensors = array_reader("sensors")
 read_way, write_way = slot_reader(Way), slot_writer(Way)
 read_message, write_message = slot_reader(Message), slot_writer(Message)
+read_kept, write_kept = slot_reader(Reference), slot_writer(Reference)  # of Arrays.references
 read_contact = array_reader("contact")
 read_trace, write_trace = array_reader("trace"), array_writer("trace")
 read_traction, write_traction = reader(Traction), writer(Traction)  # of Arrays.inputs

@@ -28,6 +28,8 @@ from tlf_env.engine.radio import (
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
+from tlf_env.numerics.memory import table
+from tlf_env.numerics.rows import entries_writer, row_writer
 from tlf_env.onboard.calibration import believed_odometry
 from tlf_env.onboard.observer import Reference
 from tlf_env.onboard.tracking import body_errors
@@ -44,7 +46,7 @@ from tlf_env.task.observation import (
     preview_entries,
     scaled,
 )
-from tlf_env.task.reward import reward_terms
+from tlf_env.task.reward import RewardTerms, reward_terms
 
 # For each EndReason, whether it is a failure of the robot itself, or cuts the episode off.
 TERMINATES = (False, True, True, False, False)
@@ -52,6 +54,20 @@ TRUNCATES = (False, False, False, True, True)
 CLIPPED = Info._fields.index("clipped")
 BODY_D = in_array("body", "d")
 SAMPLE_SIZE = len(SAMPLE_ENTRIES)  # the first fields of a Sample
+# A row is written to a column of a table first. So a loop scales its entries, in vectors: compiled code has no
+# fields by number, and would jump to a place of its own for each.
+TRACKING_SIZE, PREVIEW_SIZE = len(Tracking._fields), len(Preview._fields)
+set_tracking, set_preview = row_writer(Tracking, 0), row_writer(Preview, 0)
+write_info, write_terms = entries_writer(Info), entries_writer(RewardTerms)
+
+
+@law
+def observe_preview(arrays: Arrays, lane: int, robot: int, place: int, preview: Preview) -> None:
+    """Write the entries of a later reference or of another robot from ``place`` on."""
+    column = table(PREVIEW_SIZE, 1)
+    set_preview(column, 0, preview)
+    for i in range(PREVIEW_SIZE):
+        arrays.observations[lane, robot, place + i] = scaled(column[i, 0], arrays.scales[place + i])
 
 
 @law
@@ -65,9 +81,7 @@ def observe_neighbour(arrays: Arrays, lane: int, robot: int, step: int, settings
         heard, its = 1.0, preview_entries(message, estimate.x, estimate.y, estimate.theta)
     place = arrays.observations.shape[2] - arrays.ranges.shape[2] - len(its) - 1
     arrays.observations[lane, robot, place] = scaled(heard, arrays.scales[place])
-    for i in range(len(its)):
-        place += 1
-        arrays.observations[lane, robot, place] = scaled(its[i], arrays.scales[place])
+    observe_preview(arrays, lane, robot, place + 1, its)
 
 
 @law
@@ -127,15 +141,14 @@ def observe_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Se
         predecessor_u_1=before.u_1,
         predecessor_u_2=before.u_2,
     )
-    entries = len(row)
-    for i in range(entries):
-        arrays.observations[lane, robot, i] = scaled(row[i], arrays.scales[i])
+    column = table(TRACKING_SIZE, 1)
+    set_tracking(column, 0, row)
+    for i in range(TRACKING_SIZE):
+        arrays.observations[lane, robot, i] = scaled(column[i, 0], arrays.scales[i])
     for p in range(arrays.previews.shape[0]):
         later = read_reference(arrays, lane, robot, step + arrays.previews[p])
         preview = preview_entries(later, estimate.x, estimate.y, estimate.theta)
-        for i in range(len(preview)):
-            j = entries + p * len(preview) + i
-            arrays.observations[lane, robot, j] = scaled(preview[i], arrays.scales[j])
+        observe_preview(arrays, lane, robot, TRACKING_SIZE + p * PREVIEW_SIZE, preview)
     if settings.neighbour_range > 0.0:
         observe_neighbour(arrays, lane, robot, step, settings)
 
@@ -252,8 +265,7 @@ def judge_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Sett
         reference_theta_rad=reference.theta,
         clipped=arrays.infos[lane, robot, CLIPPED],
     )
-    for i in range(len(info)):
-        arrays.infos[lane, robot, i] = info[i]
+    write_info(arrays.infos, lane, robot, info)
 
     if error > settings.lost_beyond and not arrays.lost[lane, robot]:
         arrays.lost[lane, robot] = arrays.lost_now[lane, robot] = True
@@ -264,10 +276,10 @@ def judge_robot(arrays: Arrays, lane: int, robot: int, step: int, settings: Sett
         arrays.last_actions[lane, robot, i] = arrays.actions[lane, robot, i]
     lost, touched = arrays.lost_now[lane, robot], arrays.touched_now[lane, robot]
     terms = reward_terms(error, change, size, trace.slip, lost, touched)
+    write_terms(arrays.terms, lane, robot, terms)
     total = 0.0
-    for i in range(len(terms)):
-        arrays.terms[lane, robot, i] = terms[i]
-        total += arrays.weights[i] * terms[i]
+    for i in range(arrays.weights.shape[0]):
+        total += arrays.weights[i] * arrays.terms[lane, robot, i]
     arrays.rewards[lane, robot] = total
 
 

@@ -8,10 +8,12 @@ from tlf_env.disturbances.channels import DROPOUT, JITTER, RADIO_DROPOUT, RADIO_
 from tlf_env.engine.arrays import (
     Arrays,
     read_estimate,
+    read_kept,
     read_message,
     read_motion,
     read_observer,
     read_trace,
+    write_kept,
     write_message,
     write_observer,
 )
@@ -149,8 +151,7 @@ def next_reference(arrays: Arrays, lane: int, robot: int, step: int, settings: S
         x, y, theta, delayed, settings.observer_gain, factor
     )
     reference = observed_reference(x, y, theta, rate_x, rate_y, rate_theta)
-    for i in range(5):
-        arrays.references[i, slot, robot, lane] = reference[i]
+    write_kept(arrays.references, slot, robot, lane, reference)
     period = settings.period
     moved = Pose(x + period * rate_x, y + period * rate_y, theta + period * rate_theta)
     write_observer(arrays.states, robot, lane, moved)
@@ -160,10 +161,5 @@ def next_reference(arrays: Arrays, lane: int, robot: int, step: int, settings: S
 def read_reference(arrays: Arrays, lane: int, robot: int, step: int) -> Reference:
     """The reference of control step ``m``, from the ring."""
     slot = step % arrays.references.shape[1]
-    return Reference(
-        arrays.references[0, slot, robot, lane],
-        arrays.references[1, slot, robot, lane],
-        arrays.references[2, slot, robot, lane],
-        arrays.references[3, slot, robot, lane],
-        arrays.references[4, slot, robot, lane],
-    )
+    reference: Reference = read_kept(arrays.references, slot, robot, lane)
+    return reference

@@ -17,6 +17,7 @@ from tlf_env.engine.layout import (
     tile_writer,
 )
 from tlf_env.numerics.compiled import law, view
+from tlf_env.numerics.memory import copy_line
 from tlf_env.numerics.rows import row_reader
 from tlf_env.physics.vehicle import Body
 
@@ -82,8 +83,30 @@ def flat(array: np.ndarray) -> np.ndarray:
 
 
 @law
-def load(tile: np.ndarray, first: int, array: np.ndarray, fields: int, columns: np.ndarray) -> None:
-    """Copy the first fields of a flat array into the tile's rows from ``first`` on."""
+def are_neighbours(columns: np.ndarray, count: int) -> bool:
+    """Whether the tile is full and its columns, which grow, follow each other in the arrays."""
+    last = columns.shape[0] - 1
+    return count > last and columns[last] - columns[0] == last
+
+
+@law
+def load(
+    tile: np.ndarray,
+    first: int,
+    array: np.ndarray,
+    fields: int,
+    columns: np.ndarray,
+    neighbours: bool,
+) -> None:
+    """Copy the first fields of a flat array into the tile's rows from ``first`` on.
+
+    Robots that are ``neighbours`` in the array are one vector, which is copied as such.
+    """
+    if neighbours:
+        begin = int(columns[0])
+        for f in range(fields):
+            copy_line(tile, first + f, 0, array, f, begin)
+        return
     for f in range(fields):
         for i in range(tile.shape[1]):
             tile[first + f, i] = array[f, columns[i]]
@@ -91,9 +114,20 @@ def load(tile: np.ndarray, first: int, array: np.ndarray, fields: int, columns: 
 
 @law
 def store(
-    tile: np.ndarray, first: int, array: np.ndarray, fields: int, columns: np.ndarray, count: int
+    tile: np.ndarray,
+    first: int,
+    array: np.ndarray,
+    fields: int,
+    columns: np.ndarray,
+    count: int,
+    neighbours: bool,
 ) -> None:
-    """Copy the tile's rows from ``first`` on back, for its first ``count`` robots."""
+    """Copy the tile's rows from ``first`` on back, for its first ``count`` robots; as :func:`load`."""
+    if neighbours:
+        begin = int(columns[0])
+        for f in range(fields):
+            copy_line(array, f, begin, tile, first + f, 0)
+        return
     for f in range(fields):
         for i in range(count):
             array[f, columns[i]] = tile[first + f, i]

@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tlf_env.engine.arrays import Arrays, read_command, read_wanted_before
+from tlf_env.engine.arrays import DOUBLES_PER_CACHE_LINE, Arrays, read_command, read_wanted_before
 from tlf_env.engine.effects import delays, fix_timing
 from tlf_env.engine.layout import (
     CONSTANTS_IN_TILE,
@@ -65,6 +65,7 @@ from tlf_env.engine.tile_rows import (
     COLUMN,
     SAMPLE,
     SAMPLE_FIELDS,
+    are_neighbours,
     columns_of,
     flat,
     load,
@@ -116,12 +117,13 @@ def ask_for(
 
     ``used`` is how many of both are used.
     """
+    first, last = columns
+    is_one_line = first // DOUBLES_PER_CACHE_LINE == last // DOUBLES_PER_CACHE_LINE
     for k in range(row, min(row + rows, used[0] + used[1])):
-        for column in columns:
-            if k < used[0]:
-                prefetch(constants, k, column)
-            else:
-                prefetch(states, k - used[0], column)
+        array, field = (constants, k) if k < used[0] else (states, k - used[0])
+        prefetch(array, field, first)
+        if not is_one_line:
+            prefetch(array, field, last)
 
 
 @law_in_double
@@ -222,8 +224,9 @@ def advance_in(
     for item in range(0, items, tile.shape[1]):
         count = min(tile.shape[1], items - item)
         assign(arrays, tile, numbers, lanes, item, count, settings)
-        load(tile, CONSTANTS_IN_TILE, constants, used[0], columns)
-        load(tile, STATES_IN_TILE, states, used[1], columns)
+        neighbours = are_neighbours(columns, count)
+        load(tile, CONSTANTS_IN_TILE, constants, used[0], columns, neighbours)
+        load(tile, STATES_IN_TILE, states, used[1], columns, neighbours)
         take_base(tile, base, states, columns)
         load_effects(tile, applied, columns)
         needs = needs_of(tile)
@@ -281,7 +284,7 @@ def advance_in(
                         for i in range(count):
                             samples[substep, f, columns[i]] = tile[SAMPLE + f, i]
                     place_samples(samples[substep], tile, base, columns, count)
-        store(tile, STATES_IN_TILE, states, used[1], columns, count)
+        store(tile, STATES_IN_TILE, states, used[1], columns, count, neighbours)
         put_back(tile, base, states, columns, count)
     if senses:
         for i in range(lanes.shape[0]):

@@ -133,3 +133,47 @@ def prefetch(_context: Any, array: Any, _row: Any, _column: Any) -> Any:
         return context.get_dummy_value()
 
     return types.none(array, place, place), build
+
+
+@intrinsic
+def copy_line(
+    _context: Any,
+    to: Any,
+    _row: Any,
+    _first: Any,
+    of: Any,
+    _field: Any,
+    _column: Any,
+) -> Any:
+    """Copy a cache line of neighbours of a row to neighbours of another one, as one vector.
+
+    A cache line of the shorter numbers: 8, or 16 if one of the arrays is of single precision.
+
+    ``to[row, first + i] = of[field, column + i]``, in the precision of ``to``. Written as a loop, each number would
+    be copied alone, since the compiler cannot know that the arrays do not overlap. Indices are not checked.
+    """
+    index = types.intp
+    width = CACHE_LINE_BYTES * 8 // min(to.dtype.bitwidth, of.dtype.bitwidth)
+
+    def build(context: Any, builder: Any, signature: Any, values: Any) -> Any:
+        def at(kind: Any, value: Any, place: Any) -> Any:
+            made = context.make_array(kind)(context, builder, value=value)
+            where = cgutils.get_item_pointer(context, builder, kind, made, place)
+            return builder.bitcast(where, _vector(kind, width).as_pointer())
+
+        kinds = signature.args
+        found = builder.load(at(kinds[3], values[3], values[4:6]), align=DOUBLE_BYTES)
+        if kinds[0].dtype.bitwidth < kinds[3].dtype.bitwidth:
+            found = builder.fptrunc(found, _vector(kinds[0], width))
+        elif kinds[0].dtype.bitwidth > kinds[3].dtype.bitwidth:
+            found = builder.fpext(found, _vector(kinds[0], width))
+        builder.store(found, at(kinds[0], values[0], values[1:3]), align=DOUBLE_BYTES)
+        return context.get_dummy_value()
+
+    return types.none(to, index, index, of, index, index), build
+
+
+def _vector(array: Any, width: int) -> Any:
+    """LLVM's type of so many numbers of an array."""
+    number = ir.DoubleType() if array.dtype == types.float64 else ir.FloatType()
+    return ir.VectorType(number, width)

@@ -67,6 +67,19 @@ def writer(row: type[Any], first: int = 0) -> Callable[..., Any]:
     return law(scope["write"])
 
 
+def entries_writer(row: type[Any], first: int = 0) -> Callable[..., Any]:
+    """Compiled ``write(array, lane, robot, row)``: a named tuple into ``array[lane, robot, first + field]``.
+
+    A loop over the fields would jump to a place of its own for each: compiled code has no fields by number.
+    """
+    lines = "\n".join(
+        f"    a[l, r, {first + i}] = row.{name}" for i, name in enumerate(row._fields)
+    )
+    scope: dict[str, Any] = {}
+    exec(f"def write(a, l, r, row):\n{lines}\n", scope)
+    return law(scope["write"])
+
+
 def slot_reader(row: type[Any]) -> Callable[..., Any]:
     """Compiled ``read(ring, slot, robot, lane)`` that gathers a named tuple from a ring of them."""
     fields = ", ".join(f"a[{i}, k, r, l]" for i in range(len(row._fields)))
