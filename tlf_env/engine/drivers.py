@@ -49,6 +49,7 @@ from tlf_env.engine.starting import STARTED, clear, start_lane
 from tlf_env.engine.substeps import trace_drive
 from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import allocating, block, driver, fetch_add, law
+from tlf_env.numerics.indices import natural
 from tlf_env.numerics.philox import unit, words
 from tlf_env.onboard.calibration import believed_odometry
 from tlf_env.onboard.kinds import TRUTH
@@ -190,13 +191,13 @@ def take_actions(arrays: Arrays, lane: int, settings: Settings) -> None:
 def take_all_actions(arrays: Arrays, first: int, last: int, settings: Settings) -> None:
     """:func:`take_actions` of the lanes from ``first`` to before ``last``."""
     for lane in range(first, last):
-        take_actions(arrays, lane, settings)
+        take_actions(arrays, natural(lane), settings)
 
 
 @law
 def transmit_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
     """Count the control step, and broadcast from all robots."""
-    step = arrays.clock[lane, 1] + 1
+    step = natural(arrays.clock[lane, 1]) + 1
     arrays.clock[lane, 1] = step
     for robot in range(arrays.states.shape[1]):
         broadcast(arrays, lane, robot, step, settings)
@@ -209,7 +210,7 @@ def transmit_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
 def look_lane(arrays: Arrays, lane: int, settings: Settings) -> None:
     """Errors, rewards and observations of a lane at the present step."""
     robots = arrays.states.shape[1]
-    step = arrays.clock[lane, 1]
+    step = natural(arrays.clock[lane, 1])
     for robot in range(robots):
         judge_robot(arrays, lane, robot, step, settings)
         observe_robot(arrays, lane, robot, step, settings)
@@ -235,10 +236,14 @@ def transmit_all(arrays: Arrays, first: int, last: int, referred: int, settings:
     Then the next references of the first robots, ``referred`` of each.
     """
     for lane in range(first, last):
-        transmit_lane(arrays, lane, settings)
+        transmit_lane(arrays, natural(lane), settings)
         for robot in range(referred):
             next_reference(
-                arrays, lane, robot, arrays.clock[lane, 1] + settings.lookahead, settings
+                arrays,
+                natural(lane),
+                robot,
+                natural(arrays.clock[lane, 1] + settings.lookahead),
+                settings,
             )
 
 
@@ -246,7 +251,7 @@ def transmit_all(arrays: Arrays, first: int, last: int, referred: int, settings:
 def look_all(arrays: Arrays, first: int, last: int, settings: Settings) -> None:
     """:func:`look_lane` of the lanes from ``first`` to before ``last``."""
     for lane in range(first, last):
-        look_lane(arrays, lane, settings)
+        look_lane(arrays, natural(lane), settings)
 
 
 @driver
@@ -330,9 +335,9 @@ def find_near(arrays: Arrays, first: int, last: int, near: np.ndarray, settings:
     Without torques only its end counts.
     """
     for lane in range(first, last):
+        k = natural(lane)
         near[lane - first] = not settings.kinematic and not (
-            away_from_walls(arrays, lane, settings.period)
-            and room_to_move(arrays, lane, settings.period)
+            away_from_walls(arrays, k, settings.period) and room_to_move(arrays, k, settings.period)
         )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from tlf_env.disturbances.channels import CHANNELS
 from tlf_env.engine.arrays import Arrays, padded
 from tlf_env.numerics.compiled import block
+from tlf_env.numerics.indices import natural
 from tlf_env.task.info import Info
 from tlf_env.task.reward import RewardTerms
 
@@ -44,25 +45,25 @@ def write_excerpt(arrays: Arrays, first: int, last: int, out: Excerpt) -> None:
     """The lanes from ``first`` to before ``last``, if there is room for any."""
     if out.observations.shape[0] == 0:
         return
-    robot, numbers = out.robot, out.numbers
+    robot, numbers = natural(out.robot), out.numbers
     sensor = arrays.sensor_observations.shape[2] > 0
+    shown = arrays.sensor_observations if sensor else arrays.observations
     for lane in range(first, last):
-        for i in range(out.observations.shape[1]):
-            seen = (
-                arrays.sensor_observations[lane, robot, i]
-                if sensor
-                else arrays.observations[lane, robot, i]
-            )
-            out.observations[lane, i] = seen
-        for i in range(TERMS_ROW):
-            numbers[i, lane] = arrays.infos[lane, robot, i]
-        for i in range(APPLIED_ROW - TERMS_ROW):
-            numbers[TERMS_ROW + i, lane] = arrays.terms[lane, robot, i]
-        numbers[LOST_ROW, lane] = arrays.lost[lane, robot]
-        numbers[TOUCHED_ROW, lane] = arrays.touched[lane, robot]
-        numbers[TOUCHED_BY_ROW, lane] = arrays.touched_by[lane, robot]
-        numbers[END_ROW, lane] = arrays.ends[lane, robot]
-        numbers[REWARD_ROW, lane] = arrays.rewards[lane, robot]
+        seen, copied = shown[lane, robot], out.observations[lane]
+        for i in range(copied.shape[0]):
+            copied[i] = seen[i]
     for i in range(LOST_ROW - APPLIED_ROW):
-        for lane in range(first, last):
-            numbers[APPLIED_ROW + i, lane] = arrays.applied[i, robot, lane]
+        row, applied = numbers[APPLIED_ROW + i, first:last], arrays.applied[i, robot, first:last]
+        for k in range(row.shape[0]):
+            row[k] = applied[k]
+    for lane in range(first, last):
+        k = natural(lane)
+        for i in range(TERMS_ROW):
+            numbers[i, k] = arrays.infos[k, robot, i]
+        for i in range(APPLIED_ROW - TERMS_ROW):
+            numbers[TERMS_ROW + i, k] = arrays.terms[k, robot, i]
+        numbers[LOST_ROW, k] = arrays.lost[k, robot]
+        numbers[TOUCHED_ROW, k] = arrays.touched[k, robot]
+        numbers[TOUCHED_BY_ROW, k] = arrays.touched_by[k, robot]
+        numbers[END_ROW, k] = arrays.ends[k, robot]
+        numbers[REWARD_ROW, k] = arrays.rewards[k, robot]

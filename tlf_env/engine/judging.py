@@ -28,6 +28,7 @@ from tlf_env.engine.radio import (
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import law
+from tlf_env.numerics.indices import slot_of
 from tlf_env.numerics.memory import table
 from tlf_env.numerics.rows import entries_writer, row_writer
 from tlf_env.onboard.calibration import believed_odometry
@@ -204,7 +205,7 @@ def wanted_of_formation(
 @law
 def record_truth(arrays: Arrays, lane: int, robot: int, step: int) -> None:
     """Put a robot's true position, and its way so far, into the ring of paths."""
-    slot = step % arrays.paths.shape[1]
+    slot = slot_of(step, arrays.paths.shape[1])
     x, y = axle_midpoint(
         read_motion(arrays.states, robot, lane), arrays.constants[BODY_D, robot, lane]
     )

@@ -20,6 +20,7 @@ from tlf_env.engine.arrays import (
 from tlf_env.engine.layout import Pose
 from tlf_env.engine.settings import Settings
 from tlf_env.numerics.compiled import law
+from tlf_env.numerics.indices import slot_of
 from tlf_env.numerics.philox import unit, words
 from tlf_env.onboard.kinds import TRUTH
 from tlf_env.onboard.observer import (
@@ -41,7 +42,7 @@ def broadcast(arrays: Arrays, lane: int, robot: int, step: int, settings: Settin
     With the estimator ``truth`` the twist is the true one at the step's end. If the broadcast is lost, the
     follower continues from the last message by dead reckoning.
     """
-    slot = step % arrays.messages.shape[1]
+    slot = slot_of(step, arrays.messages.shape[1])
     if settings.estimator == TRUTH:
         u_1, u_2 = forward_and_yaw(read_motion(arrays.states, robot, lane))
     else:
@@ -56,7 +57,7 @@ def broadcast(arrays: Arrays, lane: int, robot: int, step: int, settings: Settin
         lost = unit(word) < dropout
     arrays.dropped[slot, robot, lane] = lost
     if lost:
-        before = (step - 1) % arrays.messages.shape[1]
+        before = slot_of(step - 1, arrays.messages.shape[1])
         message = dead_reckoned(read_message(arrays.messages, before, robot, lane), settings.period)
     write_message(arrays.messages, slot, robot, lane, message)
 
@@ -80,7 +81,8 @@ def received_message(
 ) -> Message:
     """A sender at a control step, by dead reckoning from its message ``late`` periods older."""
     old = max(step - late, 0)
-    message = read_message(arrays.messages, old % arrays.messages.shape[1], sender, lane)
+    slot = slot_of(old, arrays.messages.shape[1])
+    message = read_message(arrays.messages, slot, sender, lane)
     if late > 0:
         message = dead_reckoned(message, min(late, max(step, 0)) * settings.period)
     return message
@@ -113,7 +115,7 @@ def nearest_neighbour(arrays: Arrays, lane: int, robot: int, step: int, settings
 
     The true distance counts: it decides how well a radio receives.
     """
-    slot = step % arrays.paths.shape[1]
+    slot = slot_of(step, arrays.paths.shape[1])
     nearest, within = -1, settings.neighbour_range
     for other in range(robot - 1):
         away = distance(
@@ -139,7 +141,7 @@ def neighbour_message(
 @law
 def next_reference(arrays: Arrays, lane: int, robot: int, step: int, settings: Settings) -> None:
     """Put the reference of control step ``m`` into the ring and move the follower's observer on."""
-    slot = step % arrays.references.shape[1]
+    slot = slot_of(step, arrays.references.shape[1])
     if robot == 0:
         for i in range(5):
             arrays.references[i, slot, robot, lane] = arrays.tables[arrays.routes[lane], step, i]
@@ -160,6 +162,6 @@ def next_reference(arrays: Arrays, lane: int, robot: int, step: int, settings: S
 @law
 def read_reference(arrays: Arrays, lane: int, robot: int, step: int) -> Reference:
     """The reference of control step ``m``, from the ring."""
-    slot = step % arrays.references.shape[1]
+    slot = slot_of(step, arrays.references.shape[1])
     reference: Reference = read_kept(arrays.references, slot, robot, lane)
     return reference

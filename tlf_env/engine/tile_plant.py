@@ -35,6 +35,7 @@ from tlf_env.engine.tile_rows import (
     COLUMN,
     LIMITING,
     NOT_LIMITING,
+    are_neighbours,
     body_of,
     columns_of,
     contact_of,
@@ -63,7 +64,7 @@ from tlf_env.engine.tile_rows import (
     traction_of,
 )
 from tlf_env.numerics.compiled import law, law_in_double
-from tlf_env.numerics.memory import like, table
+from tlf_env.numerics.memory import copy_line, like, table
 from tlf_env.numerics.rows import choosing
 from tlf_env.physics.vehicle import (
     SLIDE_COLUMNS,
@@ -85,8 +86,15 @@ chosen_motion, chosen_contact = choosing(Motion), choosing(Contact)
 
 
 @law
-def load_effects(tile: np.ndarray, applied: np.ndarray, columns: np.ndarray) -> None:
-    """Copy the values of the channels of every substep into the tile."""
+def load_effects(
+    tile: np.ndarray, applied: np.ndarray, columns: np.ndarray, neighbours: bool
+) -> None:
+    """Copy the values of the channels of every substep into the tile; ``neighbours`` as for :func:`load`."""
+    if neighbours:
+        begin = int(columns[0])
+        for f in range(OF_SUBSTEPS.shape[0]):
+            copy_line(tile, EFFECTS_IN_TILE + f, 0, applied, OF_SUBSTEPS[f], begin)
+        return
     for f in range(OF_SUBSTEPS.shape[0]):
         for i in range(tile.shape[1]):
             tile[EFFECTS_IN_TILE + f, i] = applied[OF_SUBSTEPS[f], columns[i]]
@@ -104,7 +112,8 @@ def change_effects(
         lane, robot = column % lanes, draw.robot
         changed |= refresh(arrays, lane, robot, arrays.changing, draw.tick, 1, settings)
     if changed:
-        load_effects(tile, flat(arrays.applied), columns_of(numbers))
+        columns = columns_of(numbers)
+        load_effects(tile, flat(arrays.applied), columns, are_neighbours(columns, count))
 
 
 @law

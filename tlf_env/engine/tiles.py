@@ -76,6 +76,7 @@ from tlf_env.engine.tile_rows import (
 )
 from tlf_env.engine.tile_sensing import measure, observe_wheels, sense_tile
 from tlf_env.numerics.compiled import by_number, law, law_in_double
+from tlf_env.numerics.indices import natural
 from tlf_env.numerics.memory import doubles_beside, integers_beside, like, prefetch, table_of
 from tlf_env.onboard.kinds import EKF_GYRO
 from tlf_env.physics.vehicle import Push
@@ -141,8 +142,8 @@ def assign(
     Robots 0 of the given lanes come first, then robots 1, and so on.
     """
     for i in range(tile.shape[1]):
-        j = item + min(i, count - 1)
-        robot, lane = j // lanes.shape[0], lanes[j % lanes.shape[0]]
+        j, number = natural(item + min(i, count - 1)), natural(lanes.shape[0])
+        robot, lane = j // number, natural(lanes[j % number])
         numbers[COLUMN, i] = robot * arrays.states.shape[2] + lane
         set_draw(
             numbers,
@@ -228,7 +229,7 @@ def advance_in(
         load(tile, CONSTANTS_IN_TILE, constants, used[0], columns, neighbours)
         load(tile, STATES_IN_TILE, states, used[1], columns, neighbours)
         take_base(tile, base, states, columns)
-        load_effects(tile, applied, columns)
+        load_effects(tile, applied, columns, neighbours)
         needs = needs_of(tile)
         if needs.fixes or settings.changing:  # the last fix of every robot
             for f in range(LAST_FIX.shape[0]):

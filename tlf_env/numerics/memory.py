@@ -149,8 +149,9 @@ def copy_line(
 
     A cache line of the shorter numbers: 8, or 16 if one of the arrays is of single precision.
 
-    ``to[row, first + i] = of[field, column + i]``, in the precision of ``to``. Written as a loop, each number would
-    be copied alone, since the compiler cannot know that the arrays do not overlap. Indices are not checked.
+    ``to[row, first + i] = of[field, column + i]``, in the precision of ``to``. Written as a loop, each number
+    would be copied alone, since the compiler cannot know that the arrays do not overlap. Indices are not
+    checked.
     """
     index = types.intp
     width = CACHE_LINE_BYTES * 8 // min(to.dtype.bitwidth, of.dtype.bitwidth)

@@ -7,6 +7,7 @@ import math
 import numpy as np
 
 from tlf_env.numerics.compiled import law
+from tlf_env.numerics.indices import natural, slot_of
 
 TIME_GAP_WINDOW_S = 2.0
 ROUNDING_MM = 1e-6  # above the rounding error of a distance, and of a way
@@ -47,7 +48,7 @@ def steps_within(ways: np.ndarray, at: int, most: int, direction: int, room: flo
     while steps > 0:
         there = at + direction * steps
         there += slots if there < 0 else (-slots if there >= slots else 0)
-        if direction * (ways[there] - ways[at]) < room:
+        if direction * (ways[natural(there)] - ways[at]) < room:
             break
         steps -= steps // STEPS_TO_TRY + 1
     return steps
@@ -80,21 +81,21 @@ def time_gap_error(
     if first >= last:
         return 0.0
     likely = max(min(step - gap_steps, last - 1), first)
-    a = likely % slots
+    a = slot_of(likely, slots)
     b = a + 1 if a + 1 < slots else 0
     _, squared = nearest_on_segment(x, y, path[0, a], path[1, a], path[0, b], path[1, b])
     within = math.sqrt(squared) + ROUNDING_MM  # upper bound on the smallest distance
     # From both ends towards there, as far as all points are surely farther away.
     low, high = first, last
     while low < likely:
-        a = low % slots
+        a = slot_of(low, slots)
         room = distance(x, y, path[0, a], path[1, a]) - within
         steps = steps_within(path[2], a, likely - low, 1, room)
         if steps == 0:
             break
         low += steps
     while high > likely + 1:
-        a = high % slots
+        a = slot_of(high, slots)
         room = distance(x, y, path[0, a], path[1, a]) - within
         steps = steps_within(path[2], a, high - likely - 1, -1, room)
         if steps == 0:
@@ -102,7 +103,7 @@ def time_gap_error(
         high -= steps
     best, best_step = math.inf, 0.0
     while low < high:
-        a = low % slots
+        a = slot_of(low, slots)
         b = a + 1 if a + 1 < slots else 0
         fraction, squared = nearest_on_segment(x, y, path[0, a], path[1, a], path[0, b], path[1, b])
         if squared < best:
