@@ -38,7 +38,7 @@ test-learning: $(VENV)/.stamp-train ## Run the tests that need stable-baselines3
 	$(BIN)/pytest tests/test_sb3.py tests/test_learned.py tests/test_learners.py tests/test_doors.py tests/test_train.py \
 		tests/test_examples.py tests/test_gymnasium.py tests/test_checkpoints.py tests/test_history.py tests/test_export.py \
 		tests/test_train_search.py tests/test_sensor_policies.py tests/test_offline.py tests/test_algorithms.py \
-		tests/test_differentiable.py tests/test_neighbours.py
+		tests/test_differentiable.py tests/test_neighbours.py tests/test_trust.py
 
 check: $(VENV)/.stamp-test ## Lint, check format and types
 	$(BIN)/ruff check

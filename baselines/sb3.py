@@ -48,7 +48,8 @@ class FormationVecEnv(VecEnv):
     ----------
     scenario
         A scenario as for :class:`~tlf_env.engine.batch.BatchPlant`; several tasks as a mapping
-        ``{name: one scenario, or a sequence of them}``, which share the formations.
+        ``{name: one scenario, or a sequence of them}``, which share the formations. No name is ``base`` or
+        ``trajectory``: a mapping with such a key is a scenario.
     formations
         Number of formations in all.
     mixture
@@ -410,8 +411,11 @@ class FormationVecEnv(VecEnv):
 def _tasks(
     scenario: Source | Sequence[Source] | Mapping[str, Source | Sequence[Source]],
 ) -> list[Any]:
-    """One scenario, or a sequence of them, for each task."""
-    if isinstance(scenario, Mapping) and "trajectory" not in scenario:
+    """One scenario, or a sequence of them, for each task.
+
+    A mapping that is itself a scenario has one of the keys ``base`` and ``trajectory``.
+    """
+    if isinstance(scenario, Mapping) and not {"base", "trajectory"} & scenario.keys():
         if not scenario:
             raise ValueError("scenario: the mapping of tasks is empty")
         return list(scenario.values())

@@ -85,6 +85,13 @@ def test_tasks_of_different_size_share_one_environment():
     assert env.get_attr("scenario", [9])[0].name == "flower"
 
 
+@pytest.mark.parametrize("of", [{"base": "infinity"}, {"trajectory": "infinity", "robots": 3}])
+def test_a_scenario_that_is_a_mapping_is_one_task(of):
+    env = FormationVecEnv({**of, "horizon_s": 2.0, "end_on": ()}, 1)
+    assert env.num_envs == 3
+    assert env.get_attr("scenario", [0])[0].horizon_s == 2.0
+
+
 def test_the_interface_of_vec_env():
     env = environment(2)
     env.seed(0)
