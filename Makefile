@@ -90,9 +90,10 @@ check-install: ## Build sdist and wheel, and play the first hour in a clean envi
 	PATH="$$tmp/venv/bin:$$PATH" sh "$(CURDIR)/tests/first_hour.sh"
 
 # Their requirements exclude each other. The trainings' numbers go to results/clients; `python docs/figures/make_clients.py`
-# makes the page's tables of them. RESUME=--resume keeps the trainings that are finished.
+# makes the page's tables of them. RESUME=--resume keeps the trainings that are finished. LOWEST=--lowest takes the lowest
+# versions that pyproject.toml allows.
 clients: ## Test and train with other libraries, each of CLIENTS in a temporary environment
-	$(PYTHON) tests/clients/each.py --torch $(TORCH) $(RESUME) $(CLIENTS)
+	$(PYTHON) tests/clients/each.py --torch $(TORCH) $(RESUME) $(LOWEST) $(CLIENTS)
 
 check-clients: clients # the earlier name
 

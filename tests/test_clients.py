@@ -12,6 +12,7 @@ import json
 import os
 import re
 import sys
+import tomllib
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
@@ -629,6 +630,26 @@ def test_a_library_that_fails_does_not_keep_the_next_from_its_turn(
 
 def test_a_library_without_a_file_of_versions_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["each.py", "rya"])
+    with pytest.raises(SystemExit, match="2"):
+        each.main()
+
+
+@pytest.mark.parametrize("client", each.EXTRAS)
+def test_the_lowest_versions_are_those_of_an_extra(client: str, tmp_path: Path) -> None:
+    parts = each.commands(Path("uv"), tmp_path, client, "2.13.0", [], lowest=True)
+    project = tomllib.loads((each.ROOT / "pyproject.toml").read_text(encoding="utf-8"))["project"]
+    assert each.EXTRAS[client] in project["optional-dependencies"]
+    install = list(map(str, parts["install"][-1]))
+    assert install[install.index("--resolution") + 1] == "lowest-direct"
+    assert f"{each.ROOT}[{each.EXTRAS[client]}]" in install
+    assert str(each.HERE / f"{client}.txt") not in install
+    assert parts["trainings"][0][-1] == "results/clients-lowest"
+
+
+def test_a_library_that_the_project_does_not_name_has_no_lowest_version(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    monkeypatch.setattr(sys, "argv", ["each.py", "--lowest", "skrl"])
     with pytest.raises(SystemExit, match="2"):
         each.main()
 

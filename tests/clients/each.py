@@ -22,6 +22,8 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 NAMES = sorted(path.stem for path in HERE.glob("*.txt"))
 PARTS = ("install", "tests", "trainings")
+# The extra of pyproject.toml that has a client's libraries, and so their lowest versions.
+EXTRAS = {"benchmarl": "benchmarl", "farama": "data", "ray": "ray", "sb3": "train"}
 
 
 def tool(folder: Path) -> Path:
@@ -35,17 +37,24 @@ def tool(folder: Path) -> Path:
 
 
 def commands(
-    uv: Path, folder: Path, client: str, torch: str, more: list[str]
+    uv: Path, folder: Path, client: str, torch: str, more: list[str], lowest: bool = False
 ) -> dict[str, list[list[str | Path]]]:
-    """The commands of each part, for an environment in a folder."""
+    """The commands of each part, for an environment in a folder.
+
+    ``lowest``: with the lowest versions that pyproject.toml allows, of what it names.
+    """
     python = folder / "bin" / "python"
-    install = [uv, "pip", "install", "-q", "--python", python]
+    install: list[str | Path] = [uv, "pip", "install", "-q", "--python", python]
+    wanted: list[str | Path] = ["-e", ROOT, "-r", HERE / f"{client}.txt"]
+    if lowest:
+        wanted = ["--resolution", "lowest-direct", "-e", f"{ROOT}[{EXTRAS[client]}]"]
+        more = [*more, "--out", "results/clients-lowest"]
     return {
         "install": [
             [uv, "venv", "-q", "--python", sys.executable, folder],
             # First, so that a build of this version in a folder of wheels is taken.
             [*install, f"torch=={torch}"],
-            [*install, "-e", ROOT, f"torch=={torch}", "pytest", "-r", HERE / f"{client}.txt"],
+            [*install, *wanted, f"torch=={torch}", "pytest>=9.0"],
         ],
         "tests": [[python, "-m", "pytest", "-q", "-rs", ROOT / "tests" / "test_clients.py"]],
         "trainings": [[python, HERE / "run.py", client, *more]],
@@ -74,7 +83,7 @@ def failed_part(parts: dict[str, list[list[str | Path]]], client: str) -> str:
     return ", ".join(failed)
 
 
-def turns(clients: Iterable[str], torch: str, more: list[str]) -> dict[str, str]:
+def turns(clients: Iterable[str], torch: str, more: list[str], lowest: bool) -> dict[str, str]:
     """The parts that failed, of each client: empty where all is well."""
     outcomes = {}
     with tempfile.TemporaryDirectory(prefix="tlf-clients-") as kept:
@@ -83,7 +92,7 @@ def turns(clients: Iterable[str], torch: str, more: list[str]) -> dict[str, str]
             print(f"== {client}", flush=True)
             begun_s = time.monotonic()
             with tempfile.TemporaryDirectory(dir=kept) as folder:
-                parts = commands(uv, Path(folder) / "venv", client, torch, more)
+                parts = commands(uv, Path(folder) / "venv", client, torch, more, lowest)
                 outcomes[client] = failed_part(parts, client)
             spent_s = time.monotonic() - begun_s
             print(f"== {client}: {outcomes[client] or 'passed'}, {spent_s:.0f} s", flush=True)
@@ -96,14 +105,22 @@ def main() -> int:
     parser.add_argument("clients", nargs="*", metavar="NAME", help=f"of {', '.join(NAMES)}")
     parser.add_argument("--torch", default="2.13.0", help="version of torch")
     parser.add_argument("--resume", action="store_true", help="keep trainings that are finished")
+    parser.add_argument(
+        "--lowest",
+        action="store_true",
+        help="with the lowest versions that pyproject.toml allows, of the clients that it names: "
+        f"{', '.join(EXTRAS)}",
+    )
     given = parser.parse_args()
-    unknown = sorted(set(given.clients) - set(NAMES))
+    known = list(EXTRAS) if given.lowest else NAMES
+    unknown = sorted(set(given.clients) - set(known))
     if unknown:
-        parser.error(f"{', '.join(unknown)}: not one of {', '.join(NAMES)}")
+        parser.error(f"{', '.join(unknown)}: not one of {', '.join(known)}")
     # A stop deletes the environment, as Ctrl-C does.
     before = signal.signal(signal.SIGTERM, lambda *_: sys.exit(128 + signal.SIGTERM))
     try:
-        outcomes = turns(given.clients or NAMES, given.torch, ["--resume"] if given.resume else [])
+        more = ["--resume"] if given.resume else []
+        outcomes = turns(given.clients or known, given.torch, more, given.lowest)
     finally:
         signal.signal(signal.SIGTERM, before)
     failed = {client: parts for client, parts in outcomes.items() if parts}
