@@ -8,7 +8,7 @@ import pytest
 from tlf_env.engine.arrays import make_arrays
 from tlf_env.engine.formation import reference_table
 from tlf_env.numerics.compiled import driver
-from tlf_env.numerics.memory import CACHE_LINE_BYTES, prefetch, shaped, table, zeros
+from tlf_env.numerics.memory import CACHE_LINE_BYTES, copy_line, prefetch, shaped, table, zeros
 from tlf_env.task.scenario import load_scenario
 
 
@@ -23,6 +23,11 @@ def place_of_a_table(numbers: np.ndarray) -> int:
         for j in range(8):
             numbers[i, j] = 2.0 * same[i, j]
     return t.ctypes.data
+
+
+@driver
+def copy_one(to: np.ndarray, row: int, first: int, of: np.ndarray, field: int, column: int) -> None:
+    copy_line(to, row, first, of, field, column)
 
 
 @driver
@@ -45,6 +50,18 @@ def test_asking_ahead_changes_nothing():
     numbers = np.arange(40.0).reshape(5, 8)
     assert ask_for_all(numbers) == 780.0
     assert (numbers == np.arange(40.0).reshape(5, 8)).all()
+
+
+@pytest.mark.parametrize("to", [np.float64, np.float32])
+@pytest.mark.parametrize("of", [np.float64, np.float32])
+def test_a_line_is_copied_in_the_precision_of_its_place(to, of):
+    numbers = (np.random.default_rng(0).normal(size=(4, 40)) * 1e3).astype(of)
+    width = 8 if to == of == np.float64 else 16
+    found = np.full((3, 40), 7.0, dtype=to)
+    wanted = found.copy()
+    wanted[2, 5 : 5 + width] = numbers[1, 3 : 3 + width]
+    copy_one(found, 2, 5, numbers, 1, 3)
+    assert found.tobytes() == wanted.tobytes()
 
 
 @pytest.mark.parametrize("shape", [(3,), (2, 3, 5), (0, 4)])

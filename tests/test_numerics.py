@@ -6,7 +6,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -16,8 +16,9 @@ from hypothesis import strategies as st
 from tlf_env.numerics import compiled
 from tlf_env.numerics.angles import wrap
 from tlf_env.numerics.compiled import driver
+from tlf_env.numerics.indices import natural, slot_of
 from tlf_env.numerics.philox import MAX_SEED, normal_pair, unit, words
-from tlf_env.numerics.rows import replacing
+from tlf_env.numerics.rows import entries_writer, replacing
 
 untimed = settings(deadline=None)  # the first call compiles
 
@@ -212,6 +213,7 @@ def test_cache_falls_back_to_a_private_folder_when_it_cannot_be_written(tmp_path
 ONE_DRIVER = """
 import numpy as np
 from tlf_env.numerics.compiled import driver
+from tlf_env.numerics.indices import natural, slot_of
 
 @driver
 def double(a):
@@ -260,6 +262,7 @@ class Row(NamedTuple):
     third: float
 
 
+write_row = entries_writer(Row, 1)
 with_third = replacing(Row, "third")
 with_outer = replacing(Row, "third", "first")
 
@@ -276,3 +279,27 @@ def test_replacing_changes_the_named_fields_and_copies_the_others(values, new):
 def test_replacing_refuses_a_name_that_is_no_field():
     with pytest.raises(ValueError, match="Row has no field fourth"):
         replacing(Row, "first", "fourth")
+
+
+@given(st.integers(0, 2**63 - 1), st.integers(1, 2**40))
+@untimed
+def test_a_slot_is_the_remainder(step, slots):
+    assert slot_at(step, slots) == slot_of.py_func(step, slots) == step % slots
+    assert natural.py_func(step) == step
+
+
+@driver
+def slot_at(step: int, slots: int) -> int:
+    return slot_of(step, slots)
+
+
+@driver
+def write_two(array: np.ndarray, lane: int, robot: int, values: Any) -> None:
+    write_row(array, lane, robot, values)
+
+
+def test_a_row_is_written_entry_by_entry():
+    array = np.zeros((2, 3, 5))
+    write_two(array, 1, 2, Row(4.0, 5.0, 6.0))
+    assert array[1, 2].tolist() == [0.0, 4.0, 5.0, 6.0, 0.0]
+    assert array.sum() == 15.0

@@ -277,6 +277,20 @@ def test_a_tile_gives_the_bits_of_the_laws_run_one_by_one(disturbance, estimator
     assert_same(a, b)
 
 
+@pytest.mark.parametrize("precision", ["double", "single"])
+def test_robots_need_not_be_neighbours_in_the_arrays(precision):
+    """Neighbours are copied to a tile and back as vectors, others one by one."""
+    lanes = 4 * WIDTH
+    (a, s), (b, _) = (thrown_about(lanes, disturbance="combined-hard") for _ in range(2))
+    number = np.float64(0.0) if precision == "double" else np.float32(0.0)
+    s = s._replace(number=number)
+    for _ in range(5):
+        in_tiles(a, np.arange(lanes), s)
+        for first in range(3):
+            in_tiles(b, np.arange(first, lanes, 3), s)
+    assert_same(a, b)
+
+
 @driver
 def substep_by_substep(a: Arrays, lanes: np.ndarray, s: Settings) -> None:
     for k in range(s.substeps):
