@@ -45,7 +45,7 @@ from tlf_env.engine.radio import broadcast, delayed_message, next_reference
 from tlf_env.engine.rays import capsule_at, cast_rays, is_reading, meet, report_rays
 from tlf_env.engine.settings import Settings
 from tlf_env.engine.smoothing import smooth
-from tlf_env.engine.starting import STARTED, clear, start_lane
+from tlf_env.engine.starting import STARTED, start_lane
 from tlf_env.engine.substeps import trace_drive
 from tlf_env.engine.tiles import advance
 from tlf_env.numerics.compiled import allocating, block, driver, fetch_add, law
@@ -156,7 +156,7 @@ def first_bad_action(arrays: Arrays, first: int, last: int) -> int:
 
 @law
 def take_actions(arrays: Arrays, lane: int, settings: Settings) -> None:
-    """Clip the actions of a lane and turn them into commands; clears the traces."""
+    """Clip the actions of a lane and turn them into commands."""
     for robot in range(arrays.actions.shape[1]):
         if arrays.kinds[robot, lane] == REFERENCE:
             given = arrays.twists[lane, robot]
@@ -184,14 +184,18 @@ def take_actions(arrays: Arrays, lane: int, settings: Settings) -> None:
             for i in range(OF_SUBSTEPS.shape[0]):
                 evaluate(arrays, lane, robot, OF_SUBSTEPS[i], tick, settings)
         arrays.lost_now[lane, robot] = arrays.touched_now[lane, robot] = False
-    clear(arrays.states, lane, TRACE, TRACE_END)
 
 
 @block
 def take_all_actions(arrays: Arrays, first: int, last: int, settings: Settings) -> None:
-    """:func:`take_actions` of the lanes from ``first`` to before ``last``."""
+    """:func:`take_actions` of the lanes from ``first`` to before ``last``, and clear their traces."""
     for lane in range(first, last):
         take_actions(arrays, natural(lane), settings)
+    for i in range(TRACE, TRACE_END):
+        for robot in range(arrays.states.shape[1]):
+            trace = arrays.states[i, robot, first:last]
+            for k in range(trace.shape[0]):
+                trace[k] = 0.0
 
 
 @law
