@@ -4,7 +4,6 @@ PYTHON ?= python3
 TORCH ?= 2.13.0
 TESTS ?= tests
 JOBS ?= auto
-CLIENTS ?= $(basename $(notdir $(wildcard tests/clients/*.txt)))
 COMPILE :=
 
 VENV := .venv
@@ -92,7 +91,7 @@ check-install: ## Build sdist and wheel, and play the first hour in a clean envi
 # Their requirements exclude each other. The trainings' numbers go to results/clients; `python docs/figures/make_clients.py`
 # makes the page's tables of them. RESUME=--resume keeps the trainings that are finished. LOWEST=--lowest takes the lowest
 # versions that pyproject.toml allows.
-clients: ## Test and train with other libraries, each of CLIENTS in a temporary environment
+clients: ## Test and train with other libraries, or some of them (CLIENTS="sb3 ray"), each in a temporary environment
 	$(PYTHON) tests/clients/each.py --torch $(TORCH) $(RESUME) $(LOWEST) $(CLIENTS)
 
 check-clients: clients # the earlier name
