@@ -628,6 +628,20 @@ def test_a_library_that_fails_does_not_keep_the_next_from_its_turn(
     assert shown.err == "ray failed: tests\n"
 
 
+@pytest.mark.parametrize("words", [[], ["--lowest"]])
+def test_without_names_each_library_has_its_turn(
+    words: list[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    taken: list[str] = []
+    monkeypatch.setattr(each, "tool", lambda folder: folder / "uv")
+    monkeypatch.setattr(
+        each, "commands", lambda uv, folder, client, *_: taken.append(client) or parts()
+    )
+    monkeypatch.setattr(sys, "argv", ["each.py", *words])
+    assert each.main() == 0
+    assert taken == (list(each.EXTRAS) if words else sorted(CLIENTS))
+
+
 def test_a_library_without_a_file_of_versions_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sys, "argv", ["each.py", "rya"])
     with pytest.raises(SystemExit, match="2"):
