@@ -336,8 +336,8 @@ def move(
     for first in range(0, tile.shape[1], SLIDE_COLUMNS):
         last = min(first + SLIDE_COLUMNS, count)
         sliding = 0
-        for i in range(first, last):
-            if tile[ROLLS, i] == 0.0:
+        for k in range(SLIDE_COLUMNS):  # of a number that the compiler knows, in one vector
+            if tile[ROLLS, first + k] == 0.0 and first + k < last:
                 sliding += 1
         if sliding > MOST_ALONE:
             slide_together(tile, numbers, constants, first, dt)

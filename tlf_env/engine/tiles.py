@@ -16,7 +16,7 @@ from __future__ import annotations
 import numpy as np
 
 from tlf_env.engine.arrays import DOUBLES_PER_CACHE_LINE, Arrays, read_command, read_wanted_before
-from tlf_env.engine.effects import delays, fix_timing
+from tlf_env.engine.effects import OF_SUBSTEPS, delays, fix_timing
 from tlf_env.engine.layout import (
     CONSTANTS_IN_TILE,
     STATE_FIELDS,
@@ -109,19 +109,26 @@ def columns_after(
 def ask_for(
     constants: np.ndarray,
     states: np.ndarray,
+    applied: np.ndarray,
     used: tuple[int, int],
     columns: tuple[int, int],
     row: int,
     rows: int,
 ) -> None:
-    """Have so many rows from ``row`` on, of constants and then states, brought to the cache for later.
+    """Have so many rows from ``row`` on, of constants, states and channels, brought to the cache for later.
 
-    ``used`` is how many of both are used.
+    ``used`` is how many of constants and states are used.
     """
     first, last = columns
     is_one_line = first // DOUBLES_PER_CACHE_LINE == last // DOUBLES_PER_CACHE_LINE
-    for k in range(row, min(row + rows, used[0] + used[1])):
-        array, field = (constants, k) if k < used[0] else (states, k - used[0])
+    all_used = used[0] + used[1]
+    for k in range(row, min(row + rows, all_used + OF_SUBSTEPS.shape[0])):
+        if k < used[0]:
+            array, field = constants, k
+        elif k < all_used:
+            array, field = states, k - used[0]
+        else:
+            array, field = applied, OF_SUBSTEPS[k - all_used]
         prefetch(array, field, first)
         if not is_one_line:
             prefetch(array, field, last)
@@ -221,7 +228,7 @@ def advance_in(
     used = WITHOUT_GYRO
     if settings.estimator == EKF_GYRO:
         used = constants.shape[0], STATE_FIELDS
-    items, ahead = lanes.shape[0] * robots, used[0] + used[1]
+    items, ahead = lanes.shape[0] * robots, used[0] + used[1] + OF_SUBSTEPS.shape[0]
     for item in range(0, items, tile.shape[1]):
         count = min(tile.shape[1], items - item)
         assign(arrays, tile, numbers, lanes, item, count, settings)
@@ -242,7 +249,8 @@ def advance_in(
         for substep in range(begin, end):
             if end - begin > 1:
                 share = ahead // (end - begin) + 1
-                ask_for(constants, states, used, next_columns, (substep - begin) * share, share)
+                row = (substep - begin) * share
+                ask_for(constants, states, applied, used, next_columns, row, share)
             if actuates:
                 if settings.changing:
                     change_effects(arrays, tile, numbers, count, settings)
