@@ -22,8 +22,8 @@ HERE = Path(__file__).resolve().parent
 ROOT = HERE.parents[1]
 NAMES = sorted(path.stem for path in HERE.glob("*.txt"))
 PARTS = ("install", "tests", "trainings")
-# The extra of pyproject.toml that has a client's libraries, and so their lowest versions.
-EXTRAS = {"benchmarl": "benchmarl", "farama": "data", "ray": "ray", "sb3": "train"}
+# The extra of pyproject.toml that has a client's library, and so its lowest version; and what else it needs.
+EXTRAS = {"benchmarl": ["benchmarl"], "ray": ["ray", "ray[rllib]"], "sb3": ["train"]}
 
 
 def tool(folder: Path) -> Path:
@@ -47,7 +47,8 @@ def commands(
     install: list[str | Path] = [uv, "pip", "install", "-q", "--python", python]
     wanted: list[str | Path] = ["-e", ROOT, "-r", HERE / f"{client}.txt"]
     if lowest:
-        wanted = ["--resolution", "lowest-direct", "-e", f"{ROOT}[{EXTRAS[client]}]"]
+        extra, *others = EXTRAS[client]
+        wanted = ["--resolution", "lowest-direct", "-e", f"{ROOT}[{extra}]", *others]
         more = [*more, "--out", "results/clients-lowest"]
     return {
         "install": [
