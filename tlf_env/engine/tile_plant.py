@@ -69,8 +69,11 @@ from tlf_env.numerics.rows import choosing
 from tlf_env.physics.vehicle import (
     SLIDE_COLUMNS,
     SLIDE_ROWS,
+    Body,
     Contact,
+    Floor,
     Motion,
+    Push,
     advance_pose,
     begin_slide,
     end_slide,
@@ -247,6 +250,26 @@ def hand_over(
 
 
 @law_in_double
+def sliding_robot(
+    tile: np.ndarray, numbers: np.ndarray, constants: np.ndarray, i: int
+) -> tuple[Body, Motion, Contact, Floor, Push, float, float]:
+    """What sweeps need of a robot, with the torques that its motors deliver; in double precision.
+
+    Sweeps stop at a tolerance that single precision does not reach.
+    """
+    body, traction = exact_body(tile, numbers, constants, i), double_traction(traction_of(tile, i))
+    return (
+        body,
+        double_motion(motion_of(tile, i)),
+        double_contact(contact_of(tile, i)),
+        floor_under(body, double_effects(effects_of(tile, i)), traction),
+        double_push(push_of(tile, i)),
+        traction.delivered_l,
+        traction.delivered_r,
+    )
+
+
+@law_in_double
 def slide_alone(
     tile: np.ndarray,
     numbers: np.ndarray,
@@ -255,26 +278,10 @@ def slide_alone(
     last: int,
     dt: float,
 ) -> None:
-    """By sweeps, robot by robot, those from ``first`` to before ``last`` whose wheels do not all roll.
-
-    In double precision, as the sweeps stop at a tolerance that single precision does not reach.
-    """
+    """By sweeps, robot by robot, those from ``first`` to before ``last`` whose wheels do not all roll."""
     for i in range(first, last):
         if tile[ROLLS, i] == 0.0:
-            body, traction = (
-                exact_body(tile, numbers, constants, i),
-                double_traction(traction_of(tile, i)),
-            )
-            motion, impulses = slide(
-                body,
-                double_motion(motion_of(tile, i)),
-                double_contact(contact_of(tile, i)),
-                floor_under(body, double_effects(effects_of(tile, i)), traction),
-                double_push(push_of(tile, i)),
-                traction.delivered_l,
-                traction.delivered_r,
-                like(dt, 1.0),
-            )
+            motion, impulses = slide(*sliding_robot(tile, numbers, constants, i), like(dt, 1.0))
             set_moved(tile, i, motion)
             set_impulses(tile, i, impulses)
 
@@ -287,23 +294,8 @@ def slide_together(
     sweeps = table(SLIDE_ROWS, SLIDE_COLUMNS)
     for k in range(SLIDE_COLUMNS):
         i = first + k
-        body, traction = (
-            exact_body(tile, numbers, constants, i),
-            double_traction(traction_of(tile, i)),
-        )
-        begin_slide(
-            sweeps,
-            k,
-            tile[ROLLS, i] == 0.0,
-            body,
-            double_motion(motion_of(tile, i)),
-            double_contact(contact_of(tile, i)),
-            floor_under(body, double_effects(effects_of(tile, i)), traction),
-            double_push(push_of(tile, i)),
-            traction.delivered_l,
-            traction.delivered_r,
-            like(dt, 1.0),
-        )
+        robot = sliding_robot(tile, numbers, constants, i)
+        begin_slide(sweeps, k, tile[ROLLS, i] == 0.0, *robot, like(dt, 1.0))
     sweep_together(sweeps)
     for k in range(SLIDE_COLUMNS):
         i = first + k
