@@ -252,8 +252,6 @@ ROWS = (
     Row("reading", Reading, Kind.SCRATCH),
     Row("fix", Fix, Kind.SCRATCH),
     Row("yaw_rate", YawRate, Kind.SCRATCH),
-    Row("increments", Increments, Kind.SCRATCH),
-    Row("innovation", Innovation, Kind.SCRATCH),
     Row("moved", Motion, Kind.SCRATCH),  # as the plant leaves it, before the pose is advanced
     Row("impulses", Contact, Kind.SCRATCH),
     Row("rolls", Rolls, Kind.SCRATCH),

@@ -26,8 +26,6 @@ from tlf_env.engine.tile_rows import (
     fix_of,
     gyro_ekf_of,
     gyro_of,
-    increments_of,
-    innovation_of,
     motion_of,
     observed_of,
     order_of,
@@ -35,8 +33,6 @@ from tlf_env.engine.tile_rows import (
     sensors_of,
     set_estimate,
     set_gyro,
-    set_increments,
-    set_innovation,
     set_observed,
     set_reading,
     set_sample,
@@ -85,22 +81,56 @@ def measure(tile: np.ndarray, numbers: np.ndarray, disturbed: bool, gyro: bool, 
 
 
 @law
-def correct_tile(tile: np.ndarray, estimator: int) -> None:
-    """The estimators' corrections by the fixes."""
+def estimate_tile(tile: np.ndarray, substep: int, estimator: int, fixes: bool, dt: float) -> None:
+    """Prediction and correction of the filters, and what is kept of the substep."""
     for i in range(tile.shape[1]):
-        estimate, slip, innovation = correct_robot(
-            ekf_of(tile, i),
+        body, belief, slip_ekf, fix = (
+            body_of(tile, i),
+            belief_of(tile, i),
             slip_ekf_of(tile, i),
             fix_of(tile, i),
+        )
+        increments = odometry_of(body, belief, reading_of(tile, i), sensors_of(tile, i))
+        sensors, estimate, slip = predict_robot(
+            body,
+            belief,
+            ekf_of(tile, i),
+            slip_ekf,
+            motion_of(tile, i),
+            increments,
             sensors_of(tile, i),
             estimate_of(tile, i),
             slip_of(tile, i),
+            order_of(tile, i),
+            substep,
             estimator,
+            dt,
         )
+        if fixes:
+            estimate, slip, innovation = correct_robot(
+                ekf_of(tile, i), slip_ekf, fix, sensors, estimate, slip, estimator
+            )
+        else:
+            slip = correct_without_fix(slip, slip_ekf, estimator)
+            innovation = Innovation(0.0, 0.0, 0.0)
+        sensors, trace, sample = account_robot(
+            reading_of(tile, i),
+            fix,
+            yaw_rate_of(tile, i),
+            commanded_of(tile, i),
+            increments,
+            sensors,
+            estimate,
+            slip,
+            trace_of(tile, i),
+            innovation,
+            dt,
+        )
+        set_sensors(tile, i, sensors)
         set_estimate(tile, i, estimate)
-        if estimator == EKF_SLIP:
-            set_slip(tile, i, slip)
-        set_innovation(tile, i, innovation)
+        set_slip(tile, i, slip)
+        set_trace(tile, i, trace)
+        set_sample(tile, i, sample)
 
 
 @law
@@ -130,56 +160,15 @@ def sense_tile(tile: np.ndarray, substep: int, estimator: int, fixes: bool, dt: 
             set_trace(tile, i, trace)
             set_sample(tile, i, sample)
         return
-    for i in range(tile.shape[1]):
-        body, belief = body_of(tile, i), belief_of(tile, i)
-        increments = odometry_of(body, belief, reading_of(tile, i), sensors_of(tile, i))
-        set_increments(tile, i, increments)
-        sensors, estimate, slip = predict_robot(
-            body,
-            belief,
-            ekf_of(tile, i),
-            slip_ekf_of(tile, i),
-            motion_of(tile, i),
-            increments,
-            sensors_of(tile, i),
-            estimate_of(tile, i),
-            slip_of(tile, i),
-            order_of(tile, i),
-            substep,
-            estimator,
-            dt,
-        )
-        set_sensors(tile, i, sensors)
-        set_estimate(tile, i, estimate)
-        set_slip(tile, i, slip)
-    # A loop for each estimator: with both in one, the loop does not become vectors.
+    # A loop for each estimator: with several in one, it does not become vectors.
     if fixes and estimator == EKF_SLIP:
-        correct_tile(tile, EKF_SLIP)
+        estimate_tile(tile, substep, EKF_SLIP, True, dt)
     elif fixes and estimator == EKF:
-        correct_tile(tile, EKF)
+        estimate_tile(tile, substep, EKF, True, dt)
+    elif estimator == EKF_SLIP:
+        estimate_tile(tile, substep, EKF_SLIP, False, dt)
     else:
-        for i in range(tile.shape[1]):
-            set_slip(
-                tile, i, correct_without_fix(slip_of(tile, i), slip_ekf_of(tile, i), estimator)
-            )
-            set_innovation(tile, i, Innovation(0.0, 0.0, 0.0))
-    for i in range(tile.shape[1]):
-        sensors, trace, sample = account_robot(
-            reading_of(tile, i),
-            fix_of(tile, i),
-            yaw_rate_of(tile, i),
-            commanded_of(tile, i),
-            increments_of(tile, i),
-            sensors_of(tile, i),
-            estimate_of(tile, i),
-            slip_of(tile, i),
-            trace_of(tile, i),
-            innovation_of(tile, i),
-            dt,
-        )
-        set_sensors(tile, i, sensors)
-        set_trace(tile, i, trace)
-        set_sample(tile, i, sample)
+        estimate_tile(tile, substep, estimator, False, dt)
 
 
 @law
