@@ -13,6 +13,7 @@ import numpy as np
 from stable_baselines3.common.vec_env import VecEnv
 
 from tlf_env.common.errors import shown
+from tlf_env.common.trust import Trust
 from tlf_env.engine.batch import DOUBLE, BatchPlant, Source, checked_count
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import real_numbers
@@ -94,7 +95,7 @@ class FormationVecEnv(VecEnv):
         threads: int | None = 1,
         seed: int | None = None,
         infos: InfoChoice = CHEAP_INFOS,
-        trust: bool = False,
+        trust: Trust = False,
         **overrides: Any,
     ) -> None:
         tasks = _tasks(scenario)
@@ -344,7 +345,9 @@ class FormationVecEnv(VecEnv):
         return np.concatenate([plant.observations.reshape(-1, width) for plant in self.plants])
 
     def close(self) -> None:
-        """Do nothing; there is nothing to close."""
+        """End the processes in which the policy ``residual_base`` runs, if any."""
+        for plant in self.plants:
+            plant.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
         """``scenario``, ``place``, ``render_mode`` (None), or an attribute from ``set_attr``.

@@ -18,6 +18,7 @@ from tensordict import TensorDict, TensorDictBase
 from torchrl.data import Binary, Bounded, Composite, Unbounded
 from torchrl.envs import EnvBase
 
+from tlf_env.common.trust import Trust
 from tlf_env.engine import judging, readout
 from tlf_env.engine.batch import DOUBLE, BatchPlant, Source, checked_count
 from tlf_env.engine.formation import STATE_SCALES
@@ -81,7 +82,7 @@ class FormationBatchEnv(EnvBase):
         seed: int | None = None,
         infos: InfoChoice = False,
         device: Any = "cpu",
-        trust: bool = False,
+        trust: Trust = False,
         **overrides: Any,
     ) -> None:
         self._info_keys = chosen_keys(infos)

@@ -20,6 +20,7 @@ from baselines.policies.entry_process import EntryProcess
 from baselines.policies.learned import SHIPPED
 from baselines.policies.registry import OVERRIDABLE, fit_policy, make_policy, policy_hash
 from baselines.runs.run import run_policy
+from tlf_env.common import pipes
 from tlf_env.task.scenario import load_scenario
 
 EXAMPLE = Path(__file__).resolve().parent.parent / "examples" / "entry"
@@ -149,11 +150,11 @@ def test_what_is_wrong_with_a_program_is_reported_in_one_line(
     welcome, answer, error, tmp_path, monkeypatch
 ):
     monkeypatch.setattr(entry_process, "STEP_LIMIT_S", 0.3)
-    monkeypatch.setattr(entry_process, "END_LIMIT_S", 0.1)
+    monkeypatch.setattr(pipes, "END_LIMIT_S", 0.1)
     processes = []
-    real = entry_process.subprocess.Popen
+    real = pipes.subprocess.Popen
     monkeypatch.setattr(
-        entry_process.subprocess,
+        pipes.subprocess,
         "Popen",
         lambda *args, **options: processes.append(real(*args, **options)) or processes[-1],
     )
@@ -173,7 +174,7 @@ def test_a_program_may_write_to_stderr_and_ends_with_its_policy(tmp_path):
     policy = make_policy(made_entry(tmp_path / "entry", program), SHORT, trust=True)
     record = run_policy(SHORT, policy)
     assert not record["omega_l_command_rad_s"][10:].any()
-    process = policy._process._process
+    process = policy._process._process.process
     assert process.poll() is None
     policy.close()
     assert process.poll() == 0
@@ -263,7 +264,7 @@ def test_every_file_of_an_entry_is_in_its_hash(tmp_path):
 def test_a_process_is_not_left_behind_by_a_policy_that_is_forgotten():
     policy = make_policy(NAME, SHORT, trust=True)
     run_policy(load_scenario(SHORT, horizon_s=0.1), policy)
-    process = policy._process._process
+    process = policy._process._process.process
     assert isinstance(policy._process, EntryProcess)
     del policy
     assert process.poll() is not None

@@ -308,6 +308,31 @@ def test_parts_are_made_anew_for_every_robot_at_every_reset() -> None:
             assert sorted(masses) == pytest.approx(sorted(robots * roles))
 
 
+@pytest.mark.parametrize("with_loop", [True, False])
+def test_estimators_are_called_between_the_wheel_loops(with_loop: bool) -> None:
+    calls: list[Any] = []
+
+    class Noting(Still):
+        def update(self, readings: Readings) -> Any:
+            calls.append(readings.t_s)
+            return self.pose
+
+    class NotingLoop(Still):
+        def torque(self, *_: Any) -> Any:
+            calls.append("torque")
+            return np.zeros(2)
+
+    loop = {"wheel_loop": importable(NotingLoop)} if with_loop else {}
+    env = tlf_env.parallel_env("infinity", estimator=importable(Noting), **loop)
+    env.reset(seed=0)
+    for step in range(2):
+        calls.clear()
+        env.step({agent: np.zeros(2, np.float32) for agent in env.agents})
+        ticks = range(20 * step + 1, 20 * step + 21)
+        before = ["torque"] * 3 * with_loop
+        assert calls == [call for tick in ticks for call in (*before, *[tick * 0.001] * 3)]
+
+
 def test_every_episode_starts_with_fresh_parts() -> None:
     env = tlf_env.parallel_env("infinity", **PAPERS_PARTS)
     first = drive(env, 0.4, seed=3)

@@ -127,7 +127,7 @@ def test_runs_need_permission(folder):
 
 @pytest.mark.parametrize("wrong", [1, "yes", None])
 def test_the_permission_is_true_or_false(wrong):
-    with pytest.raises(ValueError, match=r"trust .* must be True or False"):
+    with pytest.raises(ValueError, match=r"trust .* must be True, False or 'isolated'"):
         tlf_env.parallel_env("infinity", estimator="nasty:never", trust=wrong)
 
 

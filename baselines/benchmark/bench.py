@@ -43,9 +43,10 @@ def run_episode(plan: Plan, episode: Episode) -> dict[str, Any]:
 def run_block(plan: Plan, episodes: Sequence[Episode]) -> list[dict[str, Any]]:
     """Run the episodes of a block, side by side if their plant is ``batch``; their lines."""
     first = episodes[0]
-    fitted = fit_policy(first.policy, plan.scenario(first), trust=plan.trust)
-    if fitted.scenario.plant != "batch":
+    scenario = plan.scenario(first)
+    if scenario.plant != "batch":  # no policy may ask for another plant
         return [run_episode(plan, episode) for episode in episodes]
+    fitted = fit_policy(first.policy, scenario, trust=plan.trust)
     seeds = [episode.seed for episode in episodes]
     records = run_seeds(fitted.scenario, fitted.policy, seeds, name=first.policy, trust=plan.trust)
     return [

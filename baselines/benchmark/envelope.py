@@ -26,6 +26,7 @@ from baselines.runs.seed_ranges import SeedRange
 from tlf_env.common.errors import one_line
 from tlf_env.common.models import Frozen, NonNegative, Positive, is_number
 from tlf_env.common.presets import beside, is_file_name, preset_names, read_preset_or_file
+from tlf_env.common.trust import Trust
 from tlf_env.disturbances.channels import CHANNELS
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.task.scenario import Scenario, load_scenario
@@ -316,7 +317,7 @@ class EnvelopePlan:
     seeds: SeedRange
     resolution: float = RESOLUTION
     horizon_s: float | None = None
-    trust: bool = False
+    trust: Trust = False
 
     @cached_property
     def loaded(self) -> dict[str, Knob]:

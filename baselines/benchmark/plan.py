@@ -13,6 +13,7 @@ from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import SeedRange
 from tlf_env.common.errors import nearest, shown
 from tlf_env.common.presets import beside, is_file_name, preset_names, read_preset_or_file
+from tlf_env.common.trust import Trust
 from tlf_env.disturbances.model import Disturbance
 from tlf_env.task.scenario import Scenario, load_scenario
 
@@ -62,7 +63,7 @@ class Plan:
     sweep: str | None = None
     sweep_values: tuple[float, ...] = ()
     overrides: tuple[tuple[str, Any], ...] = ()
-    trust: bool = False
+    trust: Trust = False
     also: tuple[tuple[str, str], ...] = ()
 
     @property

@@ -14,6 +14,7 @@ from baselines.runs.jsonl import append_line
 from baselines.runs.provenance import git_revision, simulation_digest, versions
 from baselines.runs.seed_ranges import FIRST_TABLE_SEED, SeedRange
 from tlf_env.common.files import parse_json
+from tlf_env.common.trust import Trust
 from tlf_env.task.scenario import Scenario
 
 PUBLISHED: SeedRange = (FIRST_TABLE_SEED, FIRST_TABLE_SEED + 200)
@@ -50,7 +51,7 @@ def plan_of_test(
     seeds: SeedRange = PUBLISHED,
     key: str = "",
     *,
-    trust: bool = False,
+    trust: Trust = False,
 ) -> TestPlan:
     """The plan of a benchmark on the test set.
 

@@ -21,6 +21,7 @@ from baselines.cli.options import (
     VIDEO_FPS,
     VIDEO_SPEED,
     named_policy,
+    permission,
     start_poses,
 )
 from baselines.commands.examples import examples
@@ -145,7 +146,7 @@ def run(
             video_fps=video_fps,
             video_speed=video_speed,
         ),
-        trust=trust,
+        trust=permission(trust),
     )
     if not finished:
         raise SystemExit(stopped_status())
@@ -199,7 +200,7 @@ def view(
         seed,
         {} if phase_s is None else {"phase_s": phase_s},
         theme=theme,
-        trust=trust,
+        trust=permission(trust),
     )
 
 
@@ -231,7 +232,7 @@ def play(
         out,
         horizon_s=horizon_s,
         theme=theme,
-        trust=trust,
+        trust=permission(trust),
     )
 
 

@@ -6,7 +6,7 @@ import json
 import os
 import sys
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -16,6 +16,7 @@ from baselines.cli.options import (
     RAY,
     REPLAYS,
     TRUST,
+    permission,
 )
 from baselines.commands.examples import examples
 from baselines.console import (
@@ -28,6 +29,9 @@ from baselines.console import (
     whole_numbers,
     writable_folder,
 )
+
+if TYPE_CHECKING:
+    from tlf_env.common.trust import Trust
 
 commands = typer.Typer()
 
@@ -249,7 +253,7 @@ def bench(
             names,
             seeds if given(ctx, "seeds") else None,
             test_seed,
-            trust=trust,
+            trust=permission(trust),
             out=out or Path("results/test"),
             processes=processes or os.cpu_count() or 1,
             ray=ray,
@@ -285,7 +289,7 @@ def bench(
             for field, value in (("horizon_s", horizon_s), ("plant", plant))
             if value is not None
         ),
-        trust=trust,
+        trust=permission(trust),
     )
     warn_of_scenarios(named_scenarios(asked))
     with progress_bar("bench") as update:
@@ -357,7 +361,7 @@ def eval_(
         out=out,
         processes=processes or os.cpu_count() or 1,
         wanted=BenchFiles(figures=figures, replays=replays, as_json=as_json),
-        trust=trust,
+        trust=permission(trust),
     )
 
 
@@ -381,7 +385,7 @@ def bench_test(
     seeds: str | None,
     test_seed: str | None,
     *,
-    trust: bool,
+    trust: Trust,
     out: Path,
     processes: int,
     ray: str | None,
@@ -457,5 +461,5 @@ def export(
         joint=joint,
         name=name,
         out=out,
-        trust=trust,
+        trust=permission(trust),
     )

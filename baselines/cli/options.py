@@ -2,9 +2,14 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import typer
 
 from baselines.cli.app import completed
+
+if TYPE_CHECKING:
+    from tlf_env.common.trust import Trust
 
 DEFAULT_SYSTEM = "reference:linearised"  # written out: `tlf --help` imports nothing of tlf_env
 
@@ -47,8 +52,16 @@ RAY = typer.Option(help="Address of an existing Ray cluster to run on instead.")
 
 TRUST = typer.Option(
     "--trust",
-    help="Run code: module:factory (also where a file names it), SB3 .zip files, programs of entries.",
+    help="Run code, in processes of its own and with your rights: module:factory (also where a file names "
+    "it), SB3 .zip files, programs of entries.",
 )
+
+
+def permission(trust: bool) -> Trust:
+    """What ``--trust`` permits: code in processes of its own."""
+    from tlf_env.common.trust import ISOLATED
+
+    return ISOLATED if trust else False
 
 
 REPLAYS = typer.Option(

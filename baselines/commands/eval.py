@@ -27,6 +27,7 @@ from baselines.console import listed, progress_bar, screen, warn_of_scenarios
 from baselines.pages.replay import write_comparison
 from baselines.runs.folders import LONGEST, NOT_IN_FOLDERS, REPLAY
 from baselines.runs.provenance import command_line
+from tlf_env.common.trust import Trust
 from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
 
 RESULTS = Path("results/eval")
@@ -44,7 +45,7 @@ def eval_command(
     out: Path | None,
     processes: int,
     wanted: BenchFiles,
-    trust: bool,
+    trust: Trust,
 ) -> None:
     """Run both policies, write the files of a benchmark, and print the comparison.
 

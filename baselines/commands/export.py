@@ -12,6 +12,7 @@ from baselines.data.episodes import collected, entry_names
 from baselines.data.files import MINARI_FOLDER, About, write_minari, write_parquet
 from baselines.policies.registry import fit_policy
 from baselines.runs.provenance import versions
+from tlf_env.common.trust import Trust
 from tlf_env.envs.parallel import parallel_env
 from tlf_env.onboard.parts import check_trust
 from tlf_env.task.scenario import load_scenario
@@ -31,7 +32,7 @@ def export_command(
     joint: bool,
     name: str,
     out: Path,
-    trust: bool,
+    trust: Trust,
 ) -> None:
     """Drive a policy through every task, disturbance and seed, and write the data set.
 

@@ -14,6 +14,7 @@ from baselines.live.drive import DriveSession
 from baselines.live.play import PlayWindow
 from baselines.live.session import Session
 from baselines.live.window import LiveWindow
+from tlf_env.common.trust import Trust
 from tlf_env.task.scenario import Scenario
 
 
@@ -24,7 +25,7 @@ def view_command(
     options: Mapping[str, Any],
     *,
     theme: str,
-    trust: bool,
+    trust: Trust,
 ) -> None:
     """Show an episode in a window until it is closed.
 
@@ -48,7 +49,7 @@ def play_command(
     *,
     horizon_s: float,
     theme: str,
-    trust: bool,
+    trust: Trust,
 ) -> None:
     """Let a leader be driven by hand in a window, and write its path when that is closed.
 

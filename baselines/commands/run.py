@@ -50,6 +50,7 @@ from baselines.runs.run import Record, run_policy
 from baselines.runs.video import FPS, Film, check_video, write_video
 from baselines.tables import metrics_table
 from tlf_env.common.presets import preset_names
+from tlf_env.common.trust import Trust
 from tlf_env.numerics.philox import checked_seed
 from tlf_env.onboard.parts import check_trust
 from tlf_env.task.scenario import Scenario, load_scenario, scenario_notes
@@ -79,7 +80,7 @@ def run_command(
     options: Mapping[str, Any],
     wanted: Wanted,
     *,
-    trust: bool,
+    trust: Trust,
 ) -> bool:
     """Run a policy in a scenario, write its folder and print its table; whether it was not interrupted.
 
@@ -206,7 +207,7 @@ def _shipped_path(chosen: Scenario) -> bool:
     )
 
 
-def _usual(chosen: Scenario, name: str, seed: int, trust: bool) -> Identity | None:
+def _usual(chosen: Scenario, name: str, seed: int, trust: Trust) -> Identity | None:
     """The identity of the run that the names alone describe; None if they do not."""
     named = name in (*policy_names(), *shipped_policies()) or parse_system(name) is not None
     if not is_preset(chosen) or not named:

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from tlf_env.common.trust import Trust
 from tlf_env.envs.parallel import parallel_env
 from tlf_env.onboard.parts import Policy, predicted
 from tlf_env.task.observation import sensor_entries, tracking_entries
@@ -46,7 +47,7 @@ def robots_of(
     name: str = "policy",
     noise: float = 0.0,
     *,
-    trust: bool = False,
+    trust: Trust = False,
 ) -> list[RobotEpisode]:
     """An episode for each robot of one formation, driven by a policy in the parallel environment.
 
@@ -56,7 +57,8 @@ def robots_of(
         Standard deviation of normal noise on the actions, from 0 on, drawn anew in each step from a generator
         with the seed. The episode has the actions with it, within ±1.
     trust
-        Whether code that the scenario names (``"module:factory"``) may be imported.
+        Whether code that the scenario names (``"module:factory"``) may run: in this process (True) or in one of
+        its own (``"isolated"``).
 
     Raises
     ------
@@ -122,7 +124,7 @@ def collected(
     *,
     joint: bool,
     noise: float = 0.0,
-    trust: bool = False,
+    trust: Trust = False,
 ) -> Iterator[RobotEpisode]:
     """Episodes of every scenario and seed, those of a formation one after another."""
     for scenario, policy in scenarios:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from baselines.live.session import Session
+from tlf_env.common.trust import Trust
 from tlf_env.onboard.observer import Reference
 from tlf_env.task.scenario import Scenario, load_scenario
 from tlf_env.task.trajectories import reference_from
@@ -105,7 +106,7 @@ class DriveSession(Session):
         seed: int = 0,
         *,
         options: Mapping[str, Any] | None = None,
-        trust: bool = False,
+        trust: Trust = False,
         horizon_s: float = HORIZON_S,
     ) -> None:
         period_s = scenario.control_period_s

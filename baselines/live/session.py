@@ -10,6 +10,7 @@ import numpy as np
 
 from baselines.policies.registry import FittedPolicy, describe_overrides, fit_policy
 from baselines.runs.run import PolicyDriver
+from tlf_env.common.trust import Trust
 from tlf_env.disturbances.channels import CHANNELS, EPISODE, number
 from tlf_env.disturbances.model import PatchRow, patch_rows
 from tlf_env.engine.formation import Formation
@@ -62,7 +63,7 @@ class Session:
         seed: int = 0,
         *,
         options: Mapping[str, Any] | None = None,
-        trust: bool = False,
+        trust: Trust = False,
     ) -> None:
         self.options, self._trust = dict(options or {}), trust
         self.restart(scenario=scenario, policy=policy, seed=seed)

@@ -16,6 +16,7 @@ from baselines.policies.systems import ENTRY
 from tlf_env.common.errors import one_line, shown
 from tlf_env.common.models import Frozen
 from tlf_env.common.presets import check_named_files, read_yaml
+from tlf_env.common.trust import Trust
 from tlf_env.onboard.gyro_estimator import GyroEkfParameters
 from tlf_env.onboard.kinds import ESTIMATOR_KINDS
 from tlf_env.onboard.limiters import Limiter
@@ -110,7 +111,7 @@ def load_entry(folder: Path) -> EntryCard:
         raise ValueError(f"{path}: {one_line(error, EntryCard)}") from error
 
 
-def make_entry(name: str, scenario: Scenario, *, trust: bool) -> LearnedPolicy | EntryPolicy:
+def make_entry(name: str, scenario: Scenario, *, trust: Trust) -> LearnedPolicy | EntryPolicy:
     """The policy of an entry by its name, ``entry:FOLDER``.
 
     Raises

@@ -6,7 +6,7 @@ import hashlib
 import inspect
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, TypeGuard
 
 from pydantic import BaseModel
 
@@ -25,9 +25,11 @@ from baselines.policies.systems import (
     system_controllers,
 )
 from tlf_env.common.digest import code_of
-from tlf_env.common.errors import install_command, suggestion
+from tlf_env.common.errors import install_command, shown, suggestion
+from tlf_env.common.trust import ISOLATED, Trust
+from tlf_env.hosting.host import HostedPolicy
 from tlf_env.onboard.kinds import DEFAULT_CONTROLLER
-from tlf_env.onboard.parts import Policy, load_part, make_part
+from tlf_env.onboard.parts import Policy, load_part, make_part, runs_apart
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.observation import tracking_entries
 from tlf_env.task.scenario import Scenario, load_scenario
@@ -57,6 +59,90 @@ OVERRIDABLE = (
 MADE_FOR = ("preview_s", "rays", "neighbour")
 
 
+# Functions that are called with a policy in a process of its own, and what loads an SB3 file there.
+ABOUT, LOADER, ASKED, BIND = (
+    f"{__name__}:{name}" for name in ("facts_of", "load_zip", "asked_by", "bind_to")
+)
+
+
+class OwnProcess(HostedPolicy):
+    """A policy in a process of its own, with what the benchmark has to know of it."""
+
+    @property
+    def privileged(self) -> bool:
+        """Whether it uses the true state."""
+        return bool(self.facts.get("privileged"))
+
+    @property
+    def scenario_overrides(self) -> Any:
+        """Scenario fields that it asks for."""
+        return self.facts.get("scenario_overrides", {})
+
+    @property
+    def supervisor(self) -> Any:
+        """Not None if it looks out for a neighbour."""
+        return self.facts.get("supervisor")
+
+    @property
+    def files(self) -> list[Path]:
+        """Files that it is made from."""
+        return [Path(str(path)) for path in self.facts.get("files", ())]
+
+    @property
+    def learned(self) -> bool:
+        """Whether it is a learned policy, which has to be fitted to a scenario."""
+        return bool(self.facts.get("learned"))
+
+    def overrides_for(self, scenario: Scenario) -> Any:
+        """As :meth:`LearnedPolicy.overrides_for`."""
+        return self.tell(ASKED, scenario.model_dump(mode="json"))
+
+    def bind(self, name: str, scenario: Scenario) -> None:
+        """As :meth:`LearnedPolicy.bind`."""
+        self.tell(BIND, name, scenario.model_dump(mode="json"))
+
+
+def asked_by(policy: LearnedPolicy, scenario: Mapping[str, Any]) -> dict[str, Any]:
+    """Scenario fields that a learned policy needs, as JSON values, for a scenario as JSON values."""
+    asked = policy.overrides_for(Scenario.model_validate(scenario))
+    return {field: _plain(value) for field, value in asked.items()}
+
+
+def bind_to(policy: LearnedPolicy, name: str, scenario: Mapping[str, Any]) -> None:
+    """Fit a learned policy to a scenario as JSON values."""
+    policy.bind(name, Scenario.model_validate(scenario))
+
+
+def facts_of(policy: Policy) -> dict[str, Any]:
+    """What :class:`OwnProcess` tells of a policy, as JSON values.
+
+    Raises
+    ------
+    ValueError
+        for an entry, which has a process of its own.
+    """
+    if isinstance(policy, EntryPolicy):
+        raise ValueError(
+            "a factory of an entry cannot run in a process of its own; use entry:FOLDER"
+        )
+    asked = getattr(policy, "scenario_overrides", {})
+    supervised = getattr(policy, "supervisor", None) is not None
+    return {
+        "learned": isinstance(policy, LearnedPolicy),
+        "privileged": bool(getattr(policy, "privileged", False)),
+        "scenario_overrides": {str(field): _plain(value) for field, value in asked.items()}
+        if isinstance(asked, Mapping)
+        else shown(asked),
+        "supervisor": True if supervised else None,
+        "files": [str(path.absolute()) for path in _source_files(policy)],
+    }
+
+
+def is_learned(policy: Policy) -> TypeGuard[LearnedPolicy | OwnProcess]:
+    """Whether a policy has to be fitted to a scenario."""
+    return isinstance(policy, LearnedPolicy) or (isinstance(policy, OwnProcess) and policy.learned)
+
+
 class FittedPolicy(NamedTuple):
     """A policy, and the scenario with the fields that the policy asks for."""
 
@@ -70,7 +156,7 @@ def policy_names() -> list[str]:
     return system_controllers()
 
 
-def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy:
+def make_policy(name: str, scenario: Scenario, *, trust: Trust = False) -> Policy:
     """A policy that fits a scenario.
 
     Parameters
@@ -84,7 +170,8 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
         with SB3's ``predict``, ``entry:FOLDER`` of a competition's entry, or the path of an SB3 ``.zip``
         file.
     trust
-        Allow ``module:factory``, an SB3 ``.zip`` file and an entry's program: all of them run code.
+        Allow ``module:factory``, an SB3 ``.zip`` file and an entry's program: all of them run code, the first
+        two in this process (True) or in one of its own (``"isolated"``), an entry always in its own.
 
     Raises
     ------
@@ -93,13 +180,13 @@ def make_policy(name: str, scenario: Scenario, *, trust: bool = False) -> Policy
         not fit the scenario.
     """
     policy = _made(name, scenario, trust=trust)
-    if isinstance(policy, LearnedPolicy):
+    if is_learned(policy):
         policy.bind(name, scenario)
     _check_heard(name, policy, scenario)
     return policy
 
 
-def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedPolicy:
+def fit_policy(name: str, scenario: Scenario, *, trust: Trust = False) -> FittedPolicy:
     """A policy, and the scenario with the fields that the policy asks for.
 
     A policy asks by an attribute ``scenario_overrides``, which maps fields of :data:`OVERRIDABLE` to
@@ -135,7 +222,7 @@ def fit_policy(name: str, scenario: Scenario, *, trust: bool = False) -> FittedP
         scenario = fitted if asked else scenario
         if asked.keys() & MADE_FOR and isinstance(policy, Law | LimitedLaw):
             policy = _made(name, scenario, trust=trust)
-    if isinstance(policy, LearnedPolicy):
+    if is_learned(policy):
         policy.bind(name, scenario)
     elif isinstance(policy, EntryPolicy):
         policy.bind(scenario)
@@ -173,7 +260,7 @@ def describe_overrides(overrides: Mapping[str, Any]) -> list[str]:
 
 def _asked(name: str, policy: Policy, scenario: Scenario) -> dict[str, Any]:
     """Fields that a policy asks for and that are not set yet."""
-    if isinstance(policy, LearnedPolicy):
+    if is_learned(policy):
         asked: Any = policy.overrides_for(scenario)
     else:
         asked = getattr(policy, "scenario_overrides", {})
@@ -210,7 +297,7 @@ def _check_named(name: str, named: Mapping[str, Any], scenario: BaseModel, group
             )
 
 
-def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
+def _made(name: str, scenario: Scenario, *, trust: Trust) -> Policy:
     if name.startswith(ENTRY):
         return make_entry(name, scenario, trust=trust)
     if name.lower().endswith(".zip"):
@@ -231,6 +318,8 @@ def _made(name: str, scenario: Scenario, *, trust: bool) -> Policy:
         check_interface(name, scenario, action="twist", observation="tracking")
         return make_law(head, tail, scenario)
     if runs_code(name):
+        if runs_apart(name, trust):
+            return OwnProcess("policy", name, ACTION_SIZE, about=ABOUT)
         return make_part("policy", name, load_part("policy", name, trust=trust))
     names = [*policy_names(), *shipped_policies()]
     raise ValueError(
@@ -285,7 +374,7 @@ def _hashed_content(path: Path) -> bytes:
 
 def _source_files(policy: Policy) -> list[Path]:
     """A learned policy's weights and card, or the file of the class and the controller file, if any."""
-    if isinstance(policy, LearnedPolicy | EntryPolicy):
+    if isinstance(policy, LearnedPolicy | EntryPolicy | OwnProcess):
         return list(policy.files)
     try:
         source = inspect.getsourcefile(type(policy))
@@ -295,13 +384,36 @@ def _source_files(policy: Policy) -> list[Path]:
     return [Path(source), *made_from] if source else []
 
 
-def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
+def _stable_baselines(path: Path, scenario: Scenario, *, trust: Trust) -> Policy:
     if not trust:
         raise ValueError(
             f"{path}: loading an SB3 file runs code that it contains; allow that with --trust"
         )
     if not path.is_file():
         raise ValueError(f"cannot read {path}: no such file")
+    entries = None
+    if scenario.observation == "tracking":
+        entries = len(tracking_entries(scenario.preview_s, scenario.rays, scenario.neighbour))
+    if trust == ISOLATED:
+        given = str(path), entries
+        return OwnProcess("policy", str(path), ACTION_SIZE, code=LOADER, given=given)
+    return load_zip(str(path), entries)
+
+
+def load_zip(file: str, entries: int | None) -> Policy:
+    """A PPO, SAC or TD3 model of stable-baselines3; its file runs code.
+
+    Parameters
+    ----------
+    entries
+        Of the observations that it must take for twists; None: any.
+
+    Raises
+    ------
+    ValueError
+        naming the file, for another model, or without stable-baselines3.
+    """
+    path = Path(file)
     try:
         from stable_baselines3.common.save_util import load_from_zip_file
     except ModuleNotFoundError as error:
@@ -311,10 +423,9 @@ def _stable_baselines(path: Path, scenario: Scenario, *, trust: bool) -> Policy:
     data, _, _ = load_from_zip_file(path, device="cpu")
     algorithm = _algorithm_of(data or {}, path)
     model = getattr(stable_baselines3, algorithm).load(path, device="cpu")
-    entries = tracking_entries(scenario.preview_s, scenario.rays, scenario.neighbour)
-    wanted = (len(entries),)
     seen, given = model.observation_space.shape, model.action_space.shape
-    if scenario.observation == "tracking" and (seen != wanted or given != (ACTION_SIZE,)):
+    wanted = (entries,)
+    if entries is not None and (seen != wanted or given != (ACTION_SIZE,)):
         raise ValueError(
             f"{path}: its observation has the shape {seen} and its action {given}; the scenario's "
             f"are {wanted} and {(ACTION_SIZE,)}"

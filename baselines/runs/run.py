@@ -10,6 +10,7 @@ import numpy as np
 
 from baselines.runs.signals import SignalTape
 from baselines.runs.stopping import taken
+from tlf_env.common.trust import Trust
 from tlf_env.engine import readout
 from tlf_env.engine.arrays import Arrays
 from tlf_env.engine.batch import BatchPlant
@@ -140,7 +141,7 @@ def run_policy(
     progress: Callable[[int, int], None] | None = None,
     watch: Callable[[Formation], None] | None = None,
     keep_interrupted: bool = False,
-    trust: bool = False,
+    trust: Trust = False,
 ) -> Record:
     """Run a policy over the whole horizon, without early ends (``end_on=()``), and record everything.
 
@@ -159,8 +160,8 @@ def run_policy(
         After an interrupt (Ctrl-C) return a record of what was simulated, marked as interrupted, once there
         is a step; without it the interrupt goes on, so that a part is never taken for the whole.
     trust
-        Whether code that the scenario names (``"module:factory"``) may be imported. Objects need no
-        permission.
+        Whether code that the scenario names (``"module:factory"``) may run: in this process (True) or in one of
+        its own (``"isolated"``). Objects need no permission.
 
     Raises
     ------
@@ -210,7 +211,7 @@ def run_seeds(
     *,
     name: str = "policy",
     most_failed: int | None = None,
-    trust: bool = False,
+    trust: Trust = False,
 ) -> Iterator[Record]:
     """Runs of several seeds side by side, without contact between robots; as :func:`run_policy`.
 

@@ -23,6 +23,7 @@ ROOMS = (
     "tlf_env.engine",
     "tlf_env.task",
     "tlf_env.disturbances",
+    "tlf_env.hosting",
     "tlf_env.onboard",
     "tlf_env.physics",
     "tlf_env.numerics",

@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 
 from tlf_env.common.errors import shown
+from tlf_env.common.trust import Trust
 from tlf_env.engine import drivers, judging, readout
 from tlf_env.engine.arrays import Arrays, make_arrays, make_variants
 from tlf_env.engine.excerpt import Excerpt, empty_excerpt
@@ -69,8 +70,8 @@ class BatchPlant:
     mixture
         True, or a share for each scenario: every episode of a formation draws its scenario, by its seed.
     trust
-        Whether a policy that ``residual_base`` names (``"module:factory"``) may be imported; a policy that is
-        given as an object needs no permission.
+        Whether a policy that ``residual_base`` names (``"module:factory"``) may run: in this process (True) or
+        in one of its own (``"isolated"``). A policy that is given as an object needs no permission.
     staggered
         Whether a reset of all formations spreads the ends of their episodes: that of formation k ends
         after (k + 1)/formations of the horizon, the later ones at the horizon. For learners: otherwise
@@ -100,7 +101,7 @@ class BatchPlant:
         mixture: bool | Sequence[float] = False,
         staggered: bool = False,
         precision: str = DOUBLE,
-        trust: bool = False,
+        trust: Trust = False,
         **overrides: Any,
     ) -> None:
         if precision not in PRECISIONS:
@@ -625,6 +626,11 @@ class BatchPlant:
         seeds = [0 if one is None else checked_seed(one) for one in seed]
         given = np.array([one is not None for one in seed])
         return given, np.array(seeds, dtype=np.int64)
+
+    def close(self) -> None:
+        """End the process in which the policy ``residual_base`` runs, if any."""
+        if self._base is not None:
+            self._base.close()
 
     def __getstate__(self) -> dict[str, Any]:
         return {**self.__dict__, "_pool": None}

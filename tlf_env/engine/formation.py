@@ -10,6 +10,7 @@ import numpy as np
 import pymunk
 
 from tlf_env.common.errors import shown
+from tlf_env.common.trust import Trust
 from tlf_env.disturbances.channels import (
     CHANNELS,
     MOVING_OBSTACLE,
@@ -31,7 +32,7 @@ from tlf_env.engine.arrays import (
 from tlf_env.engine.excerpt import empty_excerpt
 from tlf_env.engine.layout import Traction, rows_of
 from tlf_env.engine.outside_base import make_base
-from tlf_env.engine.outside_parts import Parts, part_factories
+from tlf_env.engine.outside_parts import Parts, make_crews
 from tlf_env.engine.settings import make_settings
 from tlf_env.engine.snapshot import (
     Snapshot,
@@ -105,7 +106,7 @@ class Formation:
 
     Units: mm, s, rad; arrays are views that the next step overwrites. ``parts`` gives factories for
     the ``estimator``, ``wheel_loop`` or ``observer`` that the scenario names, if they are given
-    as objects; the others are imported by name, if ``trust`` is True. ``base`` is the policy that
+    as objects; the others are imported by name, if ``trust`` allows it. ``base`` is the policy that
     ``residual_base`` names, if it is given as an object.
     """
 
@@ -115,7 +116,7 @@ class Formation:
         parts: Mapping[str, Factory] | None = None,
         base: Any = None,
         *,
-        trust: bool = False,
+        trust: Trust = False,
     ) -> None:
         self.scenario = scenario
         self._table = reference_table(scenario)
@@ -124,7 +125,8 @@ class Formation:
         kind = ChipmunkPlant if scenario.plant == "chipmunk" else PymunkPlant
         self.plant = kind(scenario.robot_models, scenario.world, scenario.control_period_s)
         self._base = make_base(scenario, base, trust=trust)
-        self._parts = Parts(part_factories(scenario, parts or {}, trust=trust), scenario)
+        crews = make_crews(scenario, parts or {}, trust=trust)
+        self._parts = Parts(crews, scenario.robot_count)
         self._settings = make_settings(scenario)
         self._packed = packed(self._settings)
         # Settings of a step that goes substep by substep though no part is outside.
@@ -209,6 +211,12 @@ class Formation:
         numbers |= {f"space/{name}": array for name, array in self.plant.get_state().items()}
         return Snapshot(KIND, self._facts(), memory, numbers)
 
+    def close(self) -> None:
+        """End the processes in which parts and policies run, if any; the next :meth:`reset` starts new ones."""
+        self._parts.close()
+        if self._base is not None:
+            self._base.close()
+
     def _facts(self) -> dict[str, Any]:
         """What must be equal where a snapshot is put back."""
         return {"scenario": self._scenario_facts, "space": self.plant.structure()}
@@ -248,7 +256,7 @@ class Formation:
             self.plant.check_state(space)
         except ValueError as error:
             raise ValueError(f"the snapshot is damaged: {error}") from error
-        parts = self._parts.restored(
+        self._parts.restored(
             state.tree("parts"), state.numbers, found["constants"], found["states"]
         )
         if self._base is not None:
@@ -256,7 +264,7 @@ class Formation:
         put_arrays(arrays, found)
         self._follow_from(phase_s)
         self.plant.set_state(space, arrays.rows("body")[:, :, 0])
-        self._parts.go_on(parts)
+        self._parts.go_on()
 
     def impose(self, values: Mapping[str, float | np.ndarray]) -> None:
         """Set channels for the coming control step: ``{path: value or one per robot}``.

@@ -9,13 +9,15 @@ from typing import Any
 import numpy as np
 
 from tlf_env.common.errors import shown
+from tlf_env.common.trust import Trust
 from tlf_env.engine.arrays import Arrays
-from tlf_env.onboard.memory import caller_state, give_caller_state
-from tlf_env.onboard.parts import Policy, load_part, make_part, part_name, predicted
+from tlf_env.hosting.host import close_policy, give_policy_state, named_policy, policy_state
+from tlf_env.onboard.parts import Policy, make_part, part_name, predicted
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.scenario import Scenario
 
 ROLE = "residual_base"
+BASE = "base"  # its arrays in a snapshot
 
 
 def separate_base(overrides: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
@@ -32,7 +34,7 @@ def separate_base(overrides: Mapping[str, Any]) -> tuple[dict[str, Any], Any]:
     return {**overrides, ROLE: part_name(named)}, base
 
 
-def make_base(scenario: Scenario, given: Any = None, *, trust: bool) -> OutsideBase | None:
+def make_base(scenario: Scenario, given: Any = None, *, trust: Trust) -> OutsideBase | None:
     """The base of a scenario that is a policy in Python; None if its base is a controller.
 
     Parameters
@@ -51,7 +53,7 @@ def make_base(scenario: Scenario, given: Any = None, *, trust: bool) -> OutsideB
     if path is None:
         return None
     if given is None:
-        return OutsideBase(path, make_part(ROLE, path, load_part(ROLE, path, trust=trust)))
+        return OutsideBase(path, named_policy(ROLE, path, ACTION_SIZE, trust=trust))
     return OutsideBase(path, make_part(ROLE, path, given if callable(given) else lambda: given))
 
 
@@ -75,7 +77,7 @@ class OutsideBase:
         ValueError
             in one line that names the policy, if its state is not plain.
         """
-        return caller_state(self._policy, self.what, "base", numbers, self._state)
+        return policy_state(self._policy, self.what, BASE, numbers, self._state)
 
     def set_state(self, tree: Any, numbers: Mapping[str, np.ndarray]) -> None:
         """Go on from a state of :meth:`get_state`.
@@ -85,7 +87,11 @@ class OutsideBase:
         ValueError
             in one line that names the policy, if it does not take its state.
         """
-        self._state = give_caller_state(self._policy, tree, self.what, numbers)
+        self._state = give_policy_state(self._policy, tree, self.what, BASE, numbers)
+
+    def close(self) -> None:
+        """End the process of the policy, if it has one."""
+        close_policy(self._policy)
 
     def command(self, arrays: Arrays) -> None:
         """Write the twists of all robots in all formations, as actions, for the coming step.

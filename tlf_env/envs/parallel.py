@@ -15,6 +15,7 @@ from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
 from tlf_env.common.errors import shown
+from tlf_env.common.trust import Trust
 from tlf_env.disturbances.channels import CHANNELS
 from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, state_dtype
 from tlf_env.engine.judging import TERMINATES, TRUNCATES
@@ -67,8 +68,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
     infos
         Whether :meth:`reset` and :meth:`step` return infos; or a sequence of the keys to return.
     trust
-        Whether code that the scenario names (``"module:factory"``) may be imported. Objects need no
-        permission.
+        Whether code that the scenario names (``"module:factory"``) may run: in this process (True) or in one of
+        its own (``"isolated"``). Objects need no permission.
     **overrides
         Fields of the scenario; ``disturbance_level`` too.
 
@@ -87,7 +88,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         render_mode: str | None = None,
         adversary: Adversary | None = None,
         infos: InfoChoice = True,
-        trust: bool = False,
+        trust: Trust = False,
         **overrides: Any,
     ) -> None:
         overrides, base = separate_base(overrides)
@@ -459,7 +460,8 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         return self._formation.leader_path()
 
     def close(self) -> None:
-        """Close the window, if any."""
+        """Close the window, if any, and end the processes of code that runs in its own."""
+        self._formation.close()
         if self._renderer is not None:
             self._renderer.close()
             self._renderer = None
@@ -484,7 +486,7 @@ def parallel_env(
     render_mode: str | None = None,
     adversary: Adversary | None = None,
     infos: InfoChoice = True,
-    trust: bool = False,
+    trust: Trust = False,
     **overrides: Any,
 ) -> FormationParallelEnv:
     """Make the parallel environment; see :class:`FormationParallelEnv`."""

@@ -12,17 +12,19 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from tlf_env.common.trust import Trust
 from tlf_env.engine.snapshot import Snapshot, checked_generator, checked_snapshot
 from tlf_env.envs.parallel import FormationParallelEnv
 from tlf_env.envs.spec import documented
-from tlf_env.onboard.memory import caller_state, give_caller_state
-from tlf_env.onboard.parts import Policy, load_part, make_part, part_name, predicted
+from tlf_env.hosting.host import close_policy, give_policy_state, named_policy, policy_state
+from tlf_env.onboard.parts import Policy, part_name, predicted
 from tlf_env.rendering.looks import RENDER_MODES
 from tlf_env.task.actions import ACTION_SIZE, TWIST
 from tlf_env.task.info import InfoChoice
 from tlf_env.task.scenario import Scenario, learners_action
 
 KIND, OTHERS = "FormationEnv", "policy of the other robots"
+DRIVER = "others"  # its role, and its arrays in a snapshot
 BY_REFERENCE = "reference"
 
 
@@ -74,8 +76,8 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
     infos
         Whether :meth:`reset` and :meth:`step` return infos; or a sequence of the keys to return.
     trust
-        Whether code that ``others`` or the scenario names (``"module:factory"``) may be imported. Objects need
-        no permission.
+        Whether code that ``others`` or the scenario names (``"module:factory"``) may run: in this process
+        (True) or in one of its own (``"isolated"``). Objects need no permission.
     **overrides
         Fields of the scenario; ``disturbance_level`` too. ``action`` is ``"tracking_twist"`` unless it, or
         the scenario's file or mapping, says otherwise; a :class:`~tlf_env.task.scenario.Scenario` keeps
@@ -99,7 +101,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         others: str | Policy = BY_REFERENCE,
         render_mode: str | None = None,
         infos: InfoChoice = True,
-        trust: bool = False,
+        trust: Trust = False,
         **overrides: Any,
     ) -> None:
         self.formation_env = FormationParallelEnv(
@@ -131,7 +133,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         }
 
     @staticmethod
-    def _make_driver(others: str | Policy, trust: bool) -> Policy | None:
+    def _make_driver(others: str | Policy, trust: Trust) -> Policy | None:
         if others == BY_REFERENCE:
             return None
         driver: Any = others
@@ -140,7 +142,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
                 raise ValueError(
                     f"others {others!r} must be {BY_REFERENCE!r}, 'module:factory' or an object"
                 )
-            driver = make_part("others", others, load_part("others", others, trust=trust))
+            driver = named_policy(DRIVER, others, ACTION_SIZE, trust=trust)
         if isinstance(driver, type) or not hasattr(driver, "predict"):
             raise ValueError(f"others {driver!r} has no predict()")
         return cast(Policy, driver)
@@ -167,7 +169,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         has one. The counters of Gymnasium's wrappers are not in it.
         """
         numbers: dict[str, np.ndarray] = {}
-        driver = caller_state(self._driver, OTHERS, "others", numbers, self._driver_state)
+        driver = policy_state(self._driver, OTHERS, DRIVER, numbers, self._driver_state)
         inner = self.formation_env.get_state()
         memory = {
             "driver_start": self._driver_start,
@@ -191,7 +193,7 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         env = self.formation_env
         env.restore(state)
         tree = state.tree("others")
-        self._driver_state = give_caller_state(self._driver, tree, OTHERS, state.numbers)
+        self._driver_state = give_policy_state(self._driver, tree, OTHERS, DRIVER, state.numbers)
         self._driver_start[:] = start
         self._np_random, self._np_random_seed = generator, seed
         observations, infos = env.now()
@@ -232,5 +234,6 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         return self.formation_env.render()
 
     def close(self) -> None:
-        """Close the window, if any."""
+        """Close the window, if any, and end the processes of code that runs in its own."""
         self.formation_env.close()
+        close_policy(self._driver)

@@ -68,7 +68,7 @@ default `twist` and `wheel_speed` are not limited, and `tracking_twist` is, by `
 of its `residual_base`.
 
 `residual_base` is a controller, by its preset or file, or a policy in Python: an object with SB3's `predict`
-from `tracking` observations to `twist` actions, or, with `trust=True`, `"module:factory"` of one. Such a policy
+from `tracking` observations to `twist` actions, or, with `trust`, `"module:factory"` of one. Such a policy
 runs once a control step for all robots, also in a batch, and a `limiter` may limit the sum.
 
 ```python
@@ -193,7 +193,7 @@ all else is replaced. A disturbance has `base`, too, as in
 `disturbance: {base: slip, slip: {delta_1_mm_s: 40}}`. `trajectory` may be the name or file of another
 scenario, whose trajectory it takes, or a CSV file of waypoints. Files that a file names lie in its own folder
 or in the working directory. Code that a scenario or a call names (`module:factory`) is imported only with
-`trust=True` ([parts.md](parts.md)), which no file can set.
+`trust=True`, or into a process of its own with `trust="isolated"` ([parts.md](parts.md)). No file can set it.
 
 In YAML files numbers are decimal (`12`, `-0.5`, `5e-1`), and only `true` and `false` are switches (YAML 1.2).
 Words and numbers that YAML 1.1 reads otherwise (`yes`, `no`, `on`, `off`, `010`, `0x1F`, `1_000`, `1:30`, a

@@ -14,6 +14,7 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from tlf_env.common.errors import shown
+from tlf_env.common.trust import Trust
 from tlf_env.engine import judging
 from tlf_env.engine.batch import DOUBLE, BatchPlant, checked_count
 from tlf_env.engine.excerpt import END_ROW, REWARD_ROW, Excerpt
@@ -116,7 +117,7 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         render_mode: str | None = None,
         max_episode_steps: int | None = None,
         infos: InfoChoice = True,
-        trust: bool = False,
+        trust: Trust = False,
         **overrides: Any,
     ) -> None:
         if "formations" in overrides:
@@ -379,4 +380,5 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         return infos
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Do nothing: there is no window to close."""
+        """End the process in which the policy ``residual_base`` runs, if any; there is no window to close."""
+        self.plant.close()

@@ -44,6 +44,7 @@ class _Packing:
         self._places: dict[int, int] = {}  # of the objects that can change, by identity
         self._kept: list[Any] = []  # so that no identity is used twice
         self._arrays: list[np.ndarray] = []
+        self._written = 0  # arrays
         self._open: set[int] = set()  # of those that contain the one at hand
 
     def pack(self, value: Any, place: str, depth: int = 0) -> Any:
@@ -100,7 +101,8 @@ class _Packing:
     def _array(self, value: np.ndarray, place: str) -> str:
         if value.dtype not in DTYPES:
             raise NotPlainError(f"{place} is an array of {value.dtype}")
-        name = f"{self._name}/{len(self._kept)}/{len(self._numbers)}"
+        name = f"{self._name}/{len(self._kept)}/{self._written}"
+        self._written += 1
         self._numbers[name] = value.copy()
         return name
 

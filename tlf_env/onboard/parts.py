@@ -4,8 +4,9 @@ A part is made by a *factory*, for each robot and again at every reset. A factor
 or the string ``"module:factory"``. It is called as ``factory(robot, period_s)`` with the robot's
 :class:`~tlf_env.physics.vehicle.RobotParameters` and the period (s) at which the part runs.
 
-A string may come from a file, so that a module is imported only if the caller allows it (``trust=True``). An
-object is code of the caller and needs no permission.
+A string may come from a file, so that a module is imported only if the caller allows it: with ``trust=True``
+into this process, with ``trust="isolated"`` into one of its own (:mod:`tlf_env.hosting`). An object is code of
+the caller and needs no permission.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ import numpy as np
 
 from tlf_env.common.errors import shown
 from tlf_env.common.models import as_float, is_number
+from tlf_env.common.trust import ISOLATED, Trust
 from tlf_env.onboard.observer import Message, Reference
 
 PART_PATTERN = r"^[A-Za-z_][\w.]*:[A-Za-z_<][\w.<>]*$"  # <locals>, <lambda>: given as objects
@@ -114,7 +116,7 @@ class Policy(Protocol):
         """Actions for a batch of observations, and the next state."""
 
 
-def check_trust(code: Mapping[str, str], trust: bool) -> None:
+def check_trust(code: Mapping[str, str], trust: Trust) -> None:
     """Check that the modules of some parts may be imported.
 
     Parameters
@@ -122,15 +124,16 @@ def check_trust(code: Mapping[str, str], trust: bool) -> None:
     code
         ``"module:factory"`` by role.
     trust
-        Whether the user allows code of any module; :data:`PYTHON_ESTIMATORS` are always allowed.
+        Whether the user allows code of any module, True or ``"isolated"``; :data:`PYTHON_ESTIMATORS` are always
+        allowed.
 
     Raises
     ------
     ValueError
         in one line that names the first part and how to allow it.
     """
-    if not isinstance(trust, bool):
-        raise ValueError(f"trust {shown(trust)} must be True or False")
+    if not isinstance(trust, bool) and trust != ISOLATED:
+        raise ValueError(f"trust {shown(trust)} must be True, False or {ISOLATED!r}")
     for role, path in code.items():
         if not trust and path not in PYTHON_ESTIMATORS.values():
             raise ValueError(
@@ -139,7 +142,12 @@ def check_trust(code: Mapping[str, str], trust: bool) -> None:
             )
 
 
-def load_part(role: str, path: str, *, trust: bool) -> Factory:
+def runs_apart(path: str, trust: Trust) -> bool:
+    """Whether the code that a name stands for runs in a process of its own."""
+    return trust == ISOLATED and path not in PYTHON_ESTIMATORS.values()
+
+
+def load_part(role: str, path: str, *, trust: Trust) -> Factory:
     """The object that ``"module:factory"`` names; modules in the working directory are found too.
 
     Parameters

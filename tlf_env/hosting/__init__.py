@@ -1,0 +1,1 @@
+"""Parts and policies of a user, in this process or in one of their own."""
