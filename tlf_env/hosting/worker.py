@@ -33,7 +33,7 @@ from tlf_env.hosting.messages import (
 )
 from tlf_env.onboard.memory import caller_state, give_caller_state
 from tlf_env.onboard.parts import Factory, load_part, make_part, predicted
-from tlf_env.physics.parameters import RobotParameters
+from tlf_env.physics.vehicle import RobotParameters
 
 LOOKED_EVERY_S = 1.0  # whether the simulation's process is still there
 OWN = ("tlf_env", "baselines")  # packages whose frames are not the place of an error
