@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter, ValidationError
 
 from tlf_env.common.errors import one_line
-from tlf_env.disturbances.signals import Signal, SignalRow, signal_value
+from tlf_env.disturbances.signals import Signal, SignalRow, is_due, signal_value
 
 ADAPTER: TypeAdapter[Signal] = TypeAdapter(Signal)
 DT_S = 0.001
@@ -43,6 +43,16 @@ def refusal(**fields):
     line = one_line(caught.value, Signal)
     assert "\n" not in line
     return line
+
+
+@pytest.mark.parametrize("ticks", [1, 3, 20])
+@pytest.mark.parametrize("every_s", [DT_S, 0.007, 0.02, 0.1])
+def test_a_drawn_signal_is_due_whenever_it_was_drawn_anew(every_s, ticks):
+    fields = {"type": "uniform", "low": 0.0, "high": 1.0, "every_s": every_s}
+    row, found = signal(**fields).row(DT_S, PERIOD_S), values(fields, range(300))
+    for tick in range(ticks, 300):
+        assert is_due(row, tick, ticks) == (found[tick] != found[tick - ticks])
+    assert is_due(row, 0, ticks)
 
 
 def test_constant_is_constant():

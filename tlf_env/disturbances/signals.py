@@ -341,7 +341,7 @@ def is_due(row: SignalRow, tick: int, ticks: int) -> bool:
     since = tick % between if between > 0 else tick
     if row.c > 0.0 and since < row.c + ticks:
         return True
-    return between > 0 and tick // between != (tick - ticks) // between
+    return between > 0 and since < ticks
 
 
 @law

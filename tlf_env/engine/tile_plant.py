@@ -106,8 +106,8 @@ def load_effects(
 @law_in_double
 def change_effects(
     arrays: Arrays, tile: np.ndarray, numbers: np.ndarray, count: int, settings: Settings
-) -> None:
-    """Evaluate the channels that may change in every substep."""
+) -> bool:
+    """Evaluate the channels that may change in every substep; return whether any may have."""
     lanes = arrays.states.shape[2]
     changed = False
     for i in range(count):
@@ -117,6 +117,7 @@ def change_effects(
     if changed:
         columns = columns_of(numbers)
         load_effects(tile, flat(arrays.applied), columns, are_neighbours(columns, count))
+    return changed
 
 
 @law

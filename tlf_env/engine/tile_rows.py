@@ -132,19 +132,18 @@ def store(
 
 
 @law
-def differ(tile: np.ndarray, rows: np.ndarray, values: np.ndarray) -> bool:
-    """Whether one of some rows of the tile has another value than given, for some robot."""
-    found = False
-    for f in range(rows.shape[0]):
-        for i in range(tile.shape[1]):
-            found |= tile[rows[f], i] != values[f]
-    return found
-
-
-@law
 def differs(tile: np.ndarray, i: int, rows: np.ndarray, values: np.ndarray) -> bool:
     """Whether one of some rows has another value than given, for the robot in column ``i``."""
     found = False
     for f in range(rows.shape[0]):
         found |= tile[rows[f], i] != values[f]
+    return found
+
+
+@law
+def differ(tile: np.ndarray, rows: np.ndarray, values: np.ndarray) -> bool:
+    """Whether one of some rows of the tile has another value than given, for some robot."""
+    found = False
+    for i in range(tile.shape[1]):
+        found |= differs(tile, i, rows, values)
     return found

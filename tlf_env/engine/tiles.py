@@ -252,8 +252,7 @@ def advance_in(
                 row = (substep - begin) * share
                 ask_for(constants, states, applied, used, next_columns, row, share)
             if actuates:
-                if settings.changing:
-                    change_effects(arrays, tile, numbers, count, settings)
+                if settings.changing and change_effects(arrays, tile, numbers, count, settings):
                     needs = needs_of(tile)
                 if settings.kinematic:
                     follow(tile, substep, dt)
