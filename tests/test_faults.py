@@ -12,6 +12,7 @@ import subprocess
 import sys
 import threading
 import time
+import weakref
 from contextlib import suppress
 from pathlib import Path
 
@@ -75,6 +76,17 @@ class Finalised:
         signal.raise_signal(signal.SIGINT)
 
 
+def end_a_weak_reference() -> None:
+    """Press Ctrl-C in the call that follows the end of an object."""
+
+    class Held:
+        pass
+
+    held = Held()
+    weakref.finalize(held, signal.raise_signal, signal.SIGINT)
+    del held
+
+
 def free_a_body() -> None:
     """Press Ctrl-C while pymunk frees a body: its library calls Python there, and drops errors."""
     import pymunk
@@ -101,7 +113,7 @@ def in_a_library() -> None:
         signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.parametrize("where", [Finalised, free_a_body, in_a_library])
+@pytest.mark.parametrize("where", [Finalised, end_a_weak_reference, free_a_body, in_a_library])
 def test_an_interrupt_where_errors_are_dropped_comes_a_little_later(where, capfd):
     def go_on() -> None:
         with interruptible():

@@ -106,13 +106,13 @@ def no_other_error() -> Iterator[None]:
 
 
 def drops_errors(frame: FrameType | None) -> bool:
-    """Whether an error that is raised in a frame may be dropped: in a finaliser, and in pymunk.
+    """Whether an error that is raised in a frame may be dropped: in a finaliser of either kind, and in pymunk.
 
     pymunk's library calls Python to free a body, for example, whenever the garbage collector runs.
     """
     while frame is not None:
         module = str(frame.f_globals.get("__name__"))
-        if frame.f_code.co_name == "__del__" or module.partition(".")[0] == "pymunk":
+        if frame.f_code.co_name == "__del__" or module.partition(".")[0] in ("pymunk", "weakref"):
             return True
         frame = frame.f_back
     return False
