@@ -241,7 +241,13 @@ def chipmunk_case(number: int, substeps: int = SUBSTEPS) -> Tally:
     plant, arrays, taken = formation.plant, formation.arrays, []
     original, pushed = plant._advance_once, {}
 
-    def advance(motions, contacts, torques, floors, dt):  # type: ignore[no-untyped-def]
+    def advance(
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        torques: np.ndarray,
+        floors: np.ndarray,
+        dt: float,
+    ) -> None:
         before, last = motions[:, :, 0].copy(), contacts[:, :, 0].copy()
         if plant._dt not in (0.0, dt):
             last[:IMPULSES] *= dt / plant._dt
@@ -255,7 +261,14 @@ def chipmunk_case(number: int, substeps: int = SUBSTEPS) -> Tally:
 
     outer = plant.advance
 
-    def whole(motions, contacts, torques, floors, dt, pushes=None):  # type: ignore[no-untyped-def]
+    def whole(
+        motions: np.ndarray,
+        contacts: np.ndarray,
+        torques: np.ndarray,
+        floors: np.ndarray,
+        dt: float,
+        pushes: np.ndarray,
+    ) -> None:
         pushed["now"] = pushes[:, :, 0].copy()
         outer(motions, contacts, torques, floors, dt, pushes)
 

@@ -114,7 +114,7 @@ def bind_to(policy: LearnedPolicy, name: str, scenario: Mapping[str, Any]) -> No
 
 
 def facts_of(policy: Policy) -> dict[str, Any]:
-    """What :class:`OwnProcess` tells of a policy, as JSON values.
+    """What :class:`OwnProcess` needs to know of a policy, as JSON values.
 
     Raises
     ------

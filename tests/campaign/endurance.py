@@ -69,7 +69,7 @@ def sample() -> Sample:
         pages * os.sysconf("SC_PAGE_SIZE") / MIB,
         tracemalloc.get_traced_memory()[0] / 1024 if tracemalloc.is_tracing() else 0.0,
         len(os.listdir("/proc/self/fd")),  # noqa: PTH208 - Path.iterdir would open the folder, too, and be counted
-        len(os.listdir("/proc/self/task")),  # noqa: PTH208 - read in the same way
+        len(os.listdir("/proc/self/task")),  # noqa: PTH208 - as the line before, so that both are counted alike
     )
 
 
