@@ -87,6 +87,19 @@ def end_a_weak_reference() -> None:
     del held
 
 
+def collect_garbage() -> None:
+    """Press Ctrl-C in a function that Python calls at each collection, as Hypothesis adds one."""
+
+    def press(phase: str, info: dict) -> None:
+        signal.raise_signal(signal.SIGINT)
+
+    gc.callbacks.append(press)
+    try:
+        gc.collect()
+    finally:
+        gc.callbacks.remove(press)
+
+
 def free_a_body() -> None:
     """Press Ctrl-C while pymunk frees a body: its library calls Python there, and drops errors."""
     import pymunk
@@ -100,11 +113,10 @@ def free_a_body() -> None:
     sys.setprofile(press)
     del body
     end = time.monotonic() + 5.0
-    while (
-        sys.getprofile() is not None
-    ):  # a body refers to itself, and another thread may be collecting now
+    # Again while another thread is collecting: then nothing happens.
+    while sys.getprofile() is not None:
         assert time.monotonic() < end, "no body was freed"
-        gc.collect()
+        gc.collect()  # a body refers to itself
 
 
 def in_a_library() -> None:
@@ -113,7 +125,9 @@ def in_a_library() -> None:
         signal.raise_signal(signal.SIGINT)
 
 
-@pytest.mark.parametrize("where", [Finalised, end_a_weak_reference, free_a_body, in_a_library])
+@pytest.mark.parametrize(
+    "where", [Finalised, end_a_weak_reference, collect_garbage, free_a_body, in_a_library]
+)
 def test_an_interrupt_where_errors_are_dropped_comes_a_little_later(where, capfd):
     def go_on() -> None:
         with interruptible():

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -64,6 +65,7 @@ def interruptible() -> Iterator[None]:
     A handler other than Python's own is left alone, and so is a signal that is ignored. In a call whose errors
     Python drops the signal is put off; after one that has dropped it, it comes again.
     """
+    report = sys.unraisablehook
 
     def interrupt(number: int, frame: FrameType | None) -> None:
         if drops_errors(frame):
@@ -73,6 +75,14 @@ def interruptible() -> Iterator[None]:
             _terminated.append(number)
         _interrupted.append(number)
         raise Interrupted(number)
+
+    def dropped(unraisable: sys.UnraisableHookArgs) -> None:
+        error = unraisable.exc_value
+        if isinstance(error, Interrupted) and error.number is not None:
+            _again(error.number)  # now: what reports errors may keep this one
+            taken(error)
+        else:
+            report(unraisable)
 
     _terminated.clear()
     _interrupted.clear()
@@ -85,8 +95,10 @@ def interruptible() -> Iterator[None]:
         for number in ours:
             signal.signal(number, interrupt)
         _running.append(object())
+        sys.unraisablehook = dropped
         yield
     finally:
+        sys.unraisablehook = report
         _running.clear()
         while _timers:
             _timers.pop().cancel()
