@@ -11,8 +11,9 @@ from tlf_env.numerics.memory import table
 from tlf_env.numerics.rows import row_reader, row_writer
 from tlf_env.physics.friction import Circle, disc
 from tlf_env.physics.parameters import Body, RobotParameters, body
-from tlf_env.physics.sliding import TYRE, found_of, set_circle, solve_tyres
+from tlf_env.physics.sliding import begin_wheel, solution_of, solve_wheels
 from tlf_env.physics.state import Contact, Floor, Motion, Push
+from tlf_env.physics.sweeps import Wheel
 from tlf_env.physics.vehicle import (
     SLIDE_COLUMNS,
     SLIDE_ROWS,
@@ -132,14 +133,29 @@ def tyres_alone(circles: np.ndarray, found: np.ndarray) -> None:
 
 @driver
 def tyres_together(circles: np.ndarray, found: np.ndarray) -> None:
-    """The same for all at once."""
+    """The same for all at once: wheels that turn without friction, and are too thin to turn their tyres."""
     t = table(SLIDE_ROWS, SLIDE_COLUMNS)
+    may_stick = False
     for i in range(SLIDE_COLUMNS):
-        set_circle(t, i, circle_at(circles, i))
-        t[TYRE, i] = 1.0
-    solve_tyres(t)
+        circle = circle_at(circles, i)
+        wheel = Wheel(
+            radius=0.0,
+            inertia=1.0,
+            inverse_inertia=1.0,
+            w_ee=circle.w_ee,
+            w_ff=circle.w_ff,
+            w_ef=circle.w_ef,
+            w_ff_turning=circle.w_ff,
+            b_e=circle.b_e,
+            b_f=circle.b_f,
+            omega_0=1.0,
+            friction=0.0,
+            grip=circle.radius,
+        )
+        may_stick |= begin_wheel(t, i, wheel, True)
+    solve_wheels(t, may_stick)
     for i in range(SLIDE_COLUMNS):
-        each = found_of(t, i)
+        each = solution_of(t, i)
         found[0, i], found[1, i], found[2, i] = each.p_e, each.p_f, each.lam
 
 

@@ -1,9 +1,8 @@
-"""Writers that are killed at random moments, and commands that are asked to stop.
+"""Writers that are killed at random moments.
 
-    python tests/campaign/kills.py kill --job bench --kills 50
-    python tests/campaign/kills.py stop
+    python tests/campaign/kills.py --job bench --kills 50
 
-``kill``: SIGKILL at random moments; half of them shortly after a file of the folder has changed. After every
+SIGKILL at random moments; half of them shortly after a file of the folder has changed. After every
 kill each file is whole and nothing finished is lost; a kill is followed by the same command. After some kills
 the command runs to its end: the folder must have the bytes of an uninterrupted run, with no temporary file.
 """

@@ -86,6 +86,28 @@ class Lifted(NamedTuple):
     s: float
 
 
+class Castor(NamedTuple):
+    """What the castor changes in a sweep."""
+
+    p_cx: float
+    p_cy: float
+    q_c: float
+    q_s: float
+    omega_c: float
+    v_e: float
+    v_f: float
+    w: float
+    s: float
+
+
+class InverseMass(NamedTuple):
+    """Inverse mass of the fork at the castor's contact, across and along the fork."""
+
+    xx: float
+    yy: float
+    xy: float
+
+
 with_left = replacing(Sweep, "p_le", "p_lf", "q_l", "omega_l", "lam_l", "v_e", "v_f", "w")
 with_right = replacing(Sweep, "p_re", "p_rf", "q_r", "omega_r", "lam_r", "v_e", "v_f", "w")
 with_fork = replacing(Sweep, "p_cx", "p_cy", "q_c", "q_s", "omega_c", "v_e", "v_f", "w", "s")
@@ -234,23 +256,21 @@ def without_castor(body: Body, sweep: Sweep, cos_p: float, sin_p: float) -> Lift
 @law
 def castor_wheel(
     body: Body,
-    w_xx: float,
-    w_yy: float,
-    w_xy: float,
+    inverse: InverseMass,
     b_x: float,
     b_y: float,
     free: Rates,
     limits: FrictionLimits,
 ) -> Wheel:
-    """The castor's wheel for inverse mass and velocity of the fork at the contact."""
+    """The castor's wheel for an inverse mass and a velocity of the fork at the contact."""
     return Wheel(
         radius=body.R_c,
         inertia=body.J_c,
         inverse_inertia=body.inverse_J_c,
-        w_ee=w_xx + limits.creep_c,
-        w_ff=w_yy + limits.creep_c,
-        w_ef=w_xy,
-        w_ff_turning=w_yy + (body.spin_castor + limits.creep_c),
+        w_ee=inverse.xx + limits.creep_c,
+        w_ff=inverse.yy + limits.creep_c,
+        w_ef=inverse.xy,
+        w_ff_turning=inverse.yy + (body.spin_castor + limits.creep_c),
         b_e=b_x,
         b_f=b_y,
         omega_0=free.omega_c,
@@ -266,18 +286,43 @@ def rate_if_locked(body: Body, lifted: Lifted) -> float:
 
 
 @law
+def inverse_mass_if_locked(body: Body, cos_p: float, sin_p: float) -> InverseMass:
+    """While the steering is locked."""
+    I_total = body.I + body.I_s
+    lever, across = body.q * cos_p + body.T, body.q * sin_p
+    return InverseMass(
+        xx=body.inverse_m + lever * lever / I_total,
+        yy=body.inverse_m + across * across / I_total,
+        xy=-lever * across / I_total,
+    )
+
+
+@law
+def inverse_mass_if_steering(body: Body, cos_p: float, sin_p: float) -> InverseMass:
+    """While the steering slides."""
+    q_cos, across = body.q * cos_p, body.q * sin_p
+    return InverseMass(
+        xx=body.inverse_m + q_cos * q_cos * body.inverse_I + body.T * body.T * body.inverse_I_s,
+        yy=body.inverse_m + across * across * body.inverse_I,
+        xy=-q_cos * across * body.inverse_I,
+    )
+
+
+@law
 def castor_if_locked(
-    body: Body, lifted: Lifted, cos_p: float, sin_p: float, free: Rates, limits: FrictionLimits
+    body: Body,
+    inverse: InverseMass,
+    lifted: Lifted,
+    cos_p: float,
+    sin_p: float,
+    free: Rates,
+    limits: FrictionLimits,
 ) -> Wheel:
     """The castor's wheel while the steering is locked."""
-    I_total = body.I + body.I_s
     rate = rate_if_locked(body, lifted)
-    lever, across = body.q * cos_p + body.T, body.q * sin_p
     return castor_wheel(
         body,
-        body.inverse_m + lever * lever / I_total,
-        body.inverse_m + across * across / I_total,
-        -lever * across / I_total,
+        inverse,
         (lifted.v_e + rate * body.q) * cos_p + lifted.v_f * sin_p + body.T * rate,
         -(lifted.v_e + rate * body.q) * sin_p + lifted.v_f * cos_p,
         free,
@@ -299,6 +344,7 @@ def turn_if_locked(
 @law
 def castor_if_steering(
     body: Body,
+    inverse: InverseMass,
     lifted: Lifted,
     q_s: float,
     cos_p: float,
@@ -308,12 +354,9 @@ def castor_if_steering(
 ) -> Wheel:
     """The castor's wheel while the steering slides with the friction impulse ``q_s``."""
     w_free, s_free = lifted.w - q_s * body.inverse_I, lifted.s + q_s * body.inverse_I_s
-    q_cos, across = body.q * cos_p, body.q * sin_p
     return castor_wheel(
         body,
-        body.inverse_m + q_cos * q_cos * body.inverse_I + body.T * body.T * body.inverse_I_s,
-        body.inverse_m + across * across * body.inverse_I,
-        -q_cos * across * body.inverse_I,
+        inverse,
         (lifted.v_e + w_free * body.q) * cos_p + lifted.v_f * sin_p + body.T * s_free,
         -(lifted.v_e + w_free * body.q) * sin_p + lifted.v_f * cos_p,
         free,
@@ -335,7 +378,7 @@ def turn_if_steering(
 
 
 @law
-def with_castor(
+def castor_after(
     body: Body,
     sweep: Sweep,
     cos_p: float,
@@ -344,13 +387,12 @@ def with_castor(
     q_s: float,
     w: float,
     s: float,
-) -> Sweep:
-    """The sweep with new impulses of castor and steering."""
+) -> Castor:
+    """New impulses of castor and steering, and the velocities with them."""
     p_ce, p_cf = castor_impulse(sweep, cos_p, sin_p)
     new_e = wheel.p_e * cos_p - wheel.p_f * sin_p
     new_f = wheel.p_e * sin_p + wheel.p_f * cos_p
-    return with_fork(
-        sweep,
+    return Castor(
         p_cx=wheel.p_e,
         p_cy=wheel.p_f,
         q_c=wheel.q,
@@ -364,19 +406,47 @@ def with_castor(
 
 
 @law
+def with_castor(sweep: Sweep, castor: Castor) -> Sweep:
+    """The sweep with what the castor changes."""
+    return with_fork(
+        sweep,
+        castor.p_cx,
+        castor.p_cy,
+        castor.q_c,
+        castor.q_s,
+        castor.omega_c,
+        castor.v_e,
+        castor.v_f,
+        castor.w,
+        castor.s,
+    )
+
+
+@law
 def solve_castor(
-    body: Body, sweep: Sweep, cos_p: float, sin_p: float, free: Rates, limits: FrictionLimits
+    body: Body,
+    if_locked: InverseMass,
+    if_steering: InverseMass,
+    sweep: Sweep,
+    cos_p: float,
+    sin_p: float,
+    free: Rates,
+    limits: FrictionLimits,
 ) -> Sweep:
     """Solve the castor: first with locked, then with sliding steering."""
     lifted = without_castor(body, sweep, cos_p, sin_p)
-    wheel = solve_wheel(castor_if_locked(body, lifted, cos_p, sin_p, free, limits))
+    wheel = solve_wheel(castor_if_locked(body, if_locked, lifted, cos_p, sin_p, free, limits))
     locked, q_s = turn_if_locked(body, lifted, cos_p, sin_p, wheel.p_e, wheel.p_f)
     if abs(q_s) <= limits.steering:
-        return with_castor(body, sweep, cos_p, sin_p, wheel, q_s, locked, locked)
+        return with_castor(
+            sweep, castor_after(body, sweep, cos_p, sin_p, wheel, q_s, locked, locked)
+        )
     q_s = math.copysign(limits.steering, q_s)
-    wheel = solve_wheel(castor_if_steering(body, lifted, q_s, cos_p, sin_p, free, limits))
+    wheel = solve_wheel(
+        castor_if_steering(body, if_steering, lifted, q_s, cos_p, sin_p, free, limits)
+    )
     w, s = turn_if_steering(body, lifted, q_s, cos_p, sin_p, wheel.p_e, wheel.p_f)
-    return with_castor(body, sweep, cos_p, sin_p, wheel, q_s, w, s)
+    return with_castor(sweep, castor_after(body, sweep, cos_p, sin_p, wheel, q_s, w, s))
 
 
 @law
@@ -451,16 +521,30 @@ def begin_sweeps(body: Body, free: Rates, contact: Contact, cos_p: float, sin_p:
 
 
 @law
-def change_of(body: Body, sweep: Sweep, before: Sweep) -> float:
+def rates_of(sweep: Sweep) -> Rates:
+    """The velocities of a sweep."""
+    return Rates(
+        v_e=sweep.v_e,
+        v_f=sweep.v_f,
+        w=sweep.w,
+        s=sweep.s,
+        omega_l=sweep.omega_l,
+        omega_r=sweep.omega_r,
+        omega_c=sweep.omega_c,
+    )
+
+
+@law
+def change_of(body: Body, after: Rates, before: Rates) -> float:
     """Largest change of a velocity by a sweep, mm/s."""
     return max(
-        max(abs(sweep.v_e - before.v_e), abs(sweep.v_f - before.v_f)),
-        max(body.h * abs(sweep.w - before.w), body.T * abs(sweep.s - before.s)),
+        max(abs(after.v_e - before.v_e), abs(after.v_f - before.v_f)),
+        max(body.h * abs(after.w - before.w), body.T * abs(after.s - before.s)),
         max(
-            body.R * abs(sweep.omega_l - before.omega_l),
-            body.R * abs(sweep.omega_r - before.omega_r),
+            body.R * abs(after.omega_l - before.omega_l),
+            body.R * abs(after.omega_r - before.omega_r),
         ),
-        body.R_c * abs(sweep.omega_c - before.omega_c),
+        body.R_c * abs(after.omega_c - before.omega_c),
     )
 
 
@@ -476,14 +560,16 @@ def sweep_on(
     sweeps: int,
 ) -> Sweep:
     """Sweeps until the velocities no longer change, at most so many."""
+    if_locked = inverse_mass_if_locked(body, cos_p, sin_p)
+    if_steering = inverse_mass_if_steering(body, cos_p, sin_p)
     for _ in range(sweeps):
-        before = sweep
+        before = rates_of(sweep)
         for side in (LEFT, RIGHT):
             lifted = without_drive_wheel(body, side, sweep)
             wheel = solve_wheel(drive_wheel(body, side, lifted, free, floor, limits))
             sweep = with_drive_wheel(body, side, sweep, lifted, wheel)
-        sweep = solve_castor(body, sweep, cos_p, sin_p, free, limits)
-        if change_of(body, sweep, before) < SWEEP_TOLERANCE_MM_S:
+        sweep = solve_castor(body, if_locked, if_steering, sweep, cos_p, sin_p, free, limits)
+        if change_of(body, rates_of(sweep), before) < SWEEP_TOLERANCE_MM_S:
             break
     return sweep
 
@@ -502,15 +588,7 @@ def end_sweeps(
     both_stick = sweep.lam_l == 0.0 and sweep.lam_r == 0.0 and floor.creep == 0.0
     even_l, even_r = share_lateral(p_le, sweep.p_lf, p_re, sweep.p_rf, limits.grip_l, limits.grip_r)
     p_le, p_re = even_l if both_stick else p_le, even_r if both_stick else p_re
-    after = Rates(
-        v_e=sweep.v_e,
-        v_f=sweep.v_f,
-        w=sweep.w,
-        s=sweep.s,
-        omega_l=sweep.omega_l,
-        omega_r=sweep.omega_r,
-        omega_c=sweep.omega_c,
-    )
+    after = rates_of(sweep)
     slips = tyre_slips(body, after, floor, cos_p, sin_p)
     return (
         after,
