@@ -26,9 +26,10 @@ from io import BufferedWriter
 from pathlib import Path
 from typing import Any, TypeVar
 
+import llvmlite.binding as llvm
 import numba
 import platformdirs
-from numba.core import types
+from numba.core import codegen, types
 from numba.core.caching import (
     CompileResultCacheImpl,
     FunctionCache,
@@ -451,17 +452,37 @@ def _quickly() -> Iterator[None]:
     """
     config: Any = numba.config
     functions: Any = types.Function
+    builders: Any = codegen
     with global_compiler_lock:  # so that no other thread restores what is set here
         threshold, level, ask = gc.get_threshold(), config.OPT, functions.get_call_type
+        builder = builders.create_pass_builder
         gc.set_threshold(*FEW)
+        builders.create_pass_builder = _create_pass_builder
         config.OPT = type(level)(min(level, LEVEL))
         functions.get_call_type = _remembering(ask)
         try:
             yield
         finally:
             functions.get_call_type = ask
+            builders.create_pass_builder = builder
             config.OPT = level
             gc.set_threshold(*threshold)
+
+
+def _create_pass_builder(
+    machine: Any, opt: int = 2, loop_vectorize: bool = False, slp_vectorize: bool = False
+) -> Any:
+    """Numba's function of this name, without unrolling.
+
+    LLVM unrolls short loops before it looks for vectors: a loop over eight robots would become its code eight
+    times, for one number each.
+    """
+    options = llvm.create_pipeline_tuning_options()
+    options.speed_level = opt
+    options.slp_vectorization = slp_vectorize
+    options.loop_vectorization = loop_vectorize
+    options.loop_unrolling = False
+    return llvm.create_pass_builder(machine, options)
 
 
 def _remembering(ask: Callable[..., Any]) -> Callable[..., Any]:

@@ -380,6 +380,15 @@ def end_steering_castor(t: np.ndarray, i: int) -> None:
 
 
 @law
+def end_sweep(t: np.ndarray, i: int) -> None:
+    """Mark whether the sweeps of a robot have converged."""
+    after = rates_of(sweep_of(t, i))
+    change = change_of(body_of(t, i), after, before_of(t, i))
+    t[SWEEPING, i] = 0.0 if change < SWEEP_TOLERANCE_MM_S else t[SWEEPING, i]
+    set_before(t, i, after)
+
+
+@law
 def sweep_once(t: np.ndarray) -> None:
     """Left wheel, right wheel, castor with locked and with sliding steering.
 
@@ -410,6 +419,10 @@ def sweep_once(t: np.ndarray) -> None:
         elif some:
             for i in range(COLUMNS):
                 end_steering_castor(t, i)
+                end_sweep(t, i)
+        else:
+            for i in range(COLUMNS):
+                end_sweep(t, i)
 
 
 @block
@@ -441,8 +454,3 @@ def sweep_together(table: np.ndarray) -> None:
             set_sweep(t, last, alone)
             return
         sweep_once(t)
-        for i in range(COLUMNS):
-            after = rates_of(sweep_of(t, i))
-            change = change_of(body_of(t, i), after, before_of(t, i))
-            t[SWEEPING, i] = 0.0 if change < SWEEP_TOLERANCE_MM_S else t[SWEEPING, i]
-            set_before(t, i, after)
