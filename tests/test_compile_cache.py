@@ -21,6 +21,7 @@ from contextlib import nullcontext
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import llvmlite.binding as llvm
 import numba
 import numpy as np
 import pytest
@@ -475,6 +476,23 @@ def test_compiling_leaves_numba_as_it_was(cache):
     assert compiled.driver(abs_of)(-1.0) == 1.0
     assert numba.types.Function.get_call_type is asks
     assert numba.config.OPT is level
+
+
+def test_vectors_are_as_wide_as_the_registers(cache):
+    """LLVM takes half of a register of 512 bits for Intel's processors; the first that had them are left so."""
+    if "+avx512vbmi2" not in str(llvm.get_host_cpu_features().flatten()):
+        pytest.skip("a processor without such registers, or one of the first that had them")
+
+    @compiled.driver
+    def double(a: np.ndarray) -> None:
+        for i in range(a.size):
+            a[i] *= 2.0
+
+    numbers = np.arange(100.0)
+    double(numbers)
+    np.testing.assert_array_equal(numbers, 2.0 * np.arange(100.0))
+    (code,) = double.inspect_asm().values()
+    assert "zmm" in code
 
 
 def test_a_driver_is_compiled_without_being_called(cache):
