@@ -209,6 +209,8 @@ def parsed() -> argparse.Namespace:
 def main() -> int:
     """Run the campaign; 1 if anything went wrong."""
     asked = parsed()
+    if asked.keep:
+        asked.keep.mkdir(parents=True, exist_ok=True)
     chosen = list(jobs.JOBS) if asked.job == "all" else [asked.job]
     outcome = record.Outcome(asked.out, {k: str(v) for k, v in vars(asked).items()})
     try:
