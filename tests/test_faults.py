@@ -234,6 +234,33 @@ def test_an_interrupt_that_ends_a_run_early_comes_once():
         signal.signal(signal.SIGINT, before)
 
 
+@pytest.mark.parametrize(
+    ("handler", "status"), [("SIG_DFL", -signal.SIGINT), ("SIG_IGN", 0)], ids=str
+)
+def test_an_interrupt_while_modules_are_imported_gives_no_traceback(handler, status):
+    """With SIG_IGN, as a shell starts a command in the background, it is ignored."""
+    code = """
+import signal, sys
+
+class Finder:
+    def find_spec(self, name, path, target=None):
+        if name == "baselines.cli":
+            signal.raise_signal(signal.SIGINT)
+
+sys.meta_path.insert(0, Finder())
+sys.argv = ["tlf", "--version"]
+from baselines.__main__ import main
+main()
+"""
+    ended = subprocess.run(
+        [sys.executable, "-c", code],
+        capture_output=True,
+        text=True,
+        preexec_fn=lambda: signal.signal(signal.SIGINT, getattr(signal, handler)),
+    )
+    assert (ended.returncode, ended.stderr) == (status, "")
+
+
 def test_an_interrupt_that_becomes_another_error_is_still_one(monkeypatch, capsys):
     """A module in C whose import is interrupted raises an ImportError."""
 

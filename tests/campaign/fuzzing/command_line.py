@@ -375,6 +375,8 @@ def in_process(words: list[str]) -> Outcome:
 def checked(words: list[str], found: Outcome) -> None:
     """Check how a command has ended."""
     line = shlex.join(words)
+    if found.status == -signal.SIGINT and "Traceback" not in found.err:
+        found = found._replace(status=0)  # the interrupt came while Python ended, after the command
     if found.status not in (0, 1, 2, 130):
         raise ViolationError(f"status {found.status!r}", f"{line}: {found.err[-300:]!r}")
     if "Traceback" in found.err:
