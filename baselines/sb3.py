@@ -103,7 +103,7 @@ class FormationVecEnv(VecEnv):
         self._starts: list[list[Start]] = []  # of the formations of each plant, for the next reset
         if checked_count("formations", formations) < len(tasks):
             raise ValueError(
-                f"formations {formations!r} must be at least one for each of {len(tasks)} tasks"
+                f"formations {shown(formations)} must be at least one for each of {len(tasks)} tasks"
             )
         overrides = learners_action(tasks, overrides)  # of all together, which need the same
         shares = [len(part) for part in np.array_split(np.arange(formations), len(tasks))]
@@ -371,7 +371,7 @@ class FormationVecEnv(VecEnv):
             plant = self.plants[where.plant]
             return plant.scenarios[plant.scenario_numbers[where.formation]]
         raise AttributeError(
-            f"a robot has no attribute {name!r}; there are {', '.join(ATTRIBUTES)}"
+            f"a robot has no attribute {shown(name)}; there are {', '.join(ATTRIBUTES)}"
         )
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:

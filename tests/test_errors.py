@@ -7,7 +7,7 @@ import json
 import re
 from collections.abc import Iterator
 from fractions import Fraction
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
 import numpy as np
@@ -24,6 +24,8 @@ from baselines.training.config import TrainConfig, load_config
 from baselines.tuning.config import TuneConfig
 from tlf_env.common.errors import nearest, one_line, shown
 from tlf_env.common.presets import preset_names, read_preset_or_file
+from tlf_env.envs.single import FormationEnv
+from tlf_env.envs.vector import FormationVectorEnv
 from tlf_env.onboard.controllers import ControllerFile, load_controller
 from tlf_env.physics.openloop import OpenLoopScenario
 from tlf_env.task.scenario import OTHER_NAMES, Scenario, load_scenario
@@ -472,3 +474,42 @@ def test_very_many_errors_are_one_short_line_at_once():
         load_scenario("infinity", preview_s=[True] * 20_000)
     assert len(str(error.value)) < 2000
     assert str(error.value).endswith("and 19994 more errors")  # than the six that are shown
+
+
+WIDE = np.full((3, 3), -1e308)  # printed in several lines
+CONSTRUCTORS = {
+    "parallel_env": (tlf_env.parallel_env, ("adversary", "render_mode", "infos")),
+    "BatchPlant": (partial(tlf_env.BatchPlant, formations=2), ("trust", "precision")),
+    "FormationEnv": (FormationEnv, ("learner", "others", "render_mode")),
+    "FormationVectorEnv": (
+        FormationVectorEnv,
+        ("num_envs", "learner", "others", "render_mode", "autoreset_mode", "trust", "precision"),
+    ),
+}
+
+
+@pytest.mark.parametrize(
+    ("door", "name"), [(door, one) for door in CONSTRUCTORS for one in CONSTRUCTORS[door][1]]
+)
+@pytest.mark.parametrize("value", [WIDE, "a\nb"], ids=["array", "text"])
+def test_an_argument_that_is_printed_in_several_lines_is_shown_in_one(door, name, value):
+    with pytest.raises(ValueError, match=f"^{name} ") as caught:
+        CONSTRUCTORS[door][0]("circle", **{name: value})
+    assert len(str(caught.value).splitlines()) == 1
+
+
+@pytest.mark.parametrize("seed", [WIDE, "a\nb"], ids=["array", "text"])
+def test_a_seed_that_is_printed_in_several_lines_is_shown_in_one(seed):
+    env = tlf_env.parallel_env("circle")
+    with pytest.raises(ValueError, match="seed") as caught:
+        env.reset(seed=seed)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_a_part_of_a_plan_that_cannot_be_printed_is_quoted(tmp_path):
+    path = tmp_path / "own.yaml"
+    names = {"controllers": ["tuned"], "estimators": ["ekf"], "limiters": ["none"], "a\rb": ["c"]}
+    path.write_text(json.dumps({"policies": names}))
+    with pytest.raises(ValueError, match=r"policies\.'a\\rb' is \['c'\]") as caught:
+        read_plan(str(path), ["policies"])
+    assert len(str(caught.value).splitlines()) == 1

@@ -11,7 +11,7 @@ from typing import Any, ClassVar, NamedTuple
 
 from baselines.runs.nested import with_value
 from baselines.runs.seed_ranges import SeedRange
-from tlf_env.common.errors import nearest, shown
+from tlf_env.common.errors import key_text, nearest, shown
 from tlf_env.common.presets import beside, is_file_name, preset_names, read_preset_or_file
 from tlf_env.common.trust import Trust
 from tlf_env.disturbances.model import Disturbance
@@ -246,8 +246,8 @@ def crossed(plan: str, parts: dict[str, Any]) -> list[str]:
         names = parts.get(part)
         if part not in wanted or not (names and isinstance(names, list)):
             raise ValueError(
-                f"plan {plan!r}: policies.{part} is {shown(names)}; policies is a list of names, or a mapping "
-                f"of {', '.join(wanted)} to one list of names each"
+                f"plan {plan!r}: policies.{key_text(part)} is {shown(names)}; policies is a list of names, "
+                f"or a mapping of {', '.join(wanted)} to one list of names each"
             )
     return ["+".join(map(str, names)) for names in itertools.product(*(parts[w] for w in wanted))]
 

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from baselines.live.session import MOST_LEVEL, MOST_PUSH_N, Session
-from tlf_env.common.errors import suggestion
+from tlf_env.common.errors import is_one_of, shown, suggestion
 from tlf_env.rendering.controls import (
     LEFT_BUTTON,
     RIGHT_BUTTON,
@@ -99,9 +99,9 @@ class LiveWindow:
         theme: str = "light",
         size_px: tuple[int, int] = SIZE_PX,
     ) -> None:
-        if theme not in THEMES:
+        if not is_one_of(theme, THEMES):
             near = suggestion(theme, THEMES)
-            raise ValueError(f"theme {theme!r} is not one of {', '.join(THEMES)}{near}")
+            raise ValueError(f"theme {shown(theme)} is not one of {', '.join(THEMES)}{near}")
         self.pg = open_display(size_px)
         self.session = session
         self.theme = THEMES[theme]

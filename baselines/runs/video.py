@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from baselines.runs.jobs import alone_in
-from tlf_env.common.errors import install_command, suggestion
+from tlf_env.common.errors import install_command, is_one_of, shown, suggestion
 from tlf_env.engine.formation import Formation
 from tlf_env.rendering.looks import THEMES, Theme
 from tlf_env.rendering.renderer import DESIGN_SIZE_PX, Renderer, import_pygame, stage_of
@@ -165,9 +165,9 @@ def write_video(
         in one line, for a path, caption, theme or films that do not fit.
     """
     check_video(path)
-    if theme not in THEMES:
+    if not is_one_of(theme, THEMES):
         raise ValueError(
-            f"theme {theme!r} is not one of {', '.join(THEMES)}{suggestion(theme, THEMES)}"
+            f"theme {shown(theme)} is not one of {', '.join(THEMES)}{suggestion(theme, THEMES)}"
         )
     if not films or len({(film.fps, film.speed) for film in films}) > 1:
         raise ValueError("a video needs films of the same fps and speed")

@@ -48,6 +48,11 @@ def shown(value: Any) -> str:
     return text if len(text) <= SHOWN else f"{text[: SHOWN - 3]}..."
 
 
+def is_one_of(value: object, names: Iterable[str]) -> bool:
+    """Whether a value is one of some names. An array, for example, cannot be compared with them."""
+    return isinstance(value, str) and value in names
+
+
 def path_text(path: object) -> str:
     """A file's path in one line: as it is, unless a character of it cannot be printed."""
     text = str(path)
@@ -181,12 +186,12 @@ def _placed(kind: Any, item: Any) -> _Found:
             chosen = in_branch = True
             continue
         allowed = tuple(dict.fromkeys(name for one in kinds for name in _fields(one)))
-        keys.append(_key(part))
+        keys.append(key_text(part))
         kinds, chosen = _children(kinds, part), False
     return _Found(tuple(keys), in_branch, allowed if unknown else (), item)
 
 
-def _key(part: object) -> str:
+def key_text(part: object) -> str:
     """A key as it is printed in a path."""
     text = str(part)
     if not text.isprintable() or not text or text != text.strip():

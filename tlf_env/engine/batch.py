@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tlf_env.common.errors import shown
+from tlf_env.common.errors import is_one_of, shown
 from tlf_env.common.trust import Trust
 from tlf_env.engine import drivers, judging, readout
 from tlf_env.engine.arrays import Arrays, make_arrays, make_variants
@@ -104,7 +104,7 @@ class BatchPlant:
         trust: Trust = False,
         **overrides: Any,
     ) -> None:
-        if precision not in PRECISIONS:
+        if not is_one_of(precision, PRECISIONS):
             raise ValueError(f"precision {shown(precision)} is not one of {', '.join(PRECISIONS)}")
         self.precision = precision
         if not isinstance(scenario, Sequence) or isinstance(scenario, str):
@@ -712,5 +712,5 @@ def checked_count(name: str, value: int) -> int:
         naming it, for anything else.
     """
     if isinstance(value, bool) or not isinstance(value, int | np.integer) or value < 1:
-        raise ValueError(f"{name} {value!r} must be a whole number, at least 1")
+        raise ValueError(f"{name} {shown(value)} must be a whole number, at least 1")
     return int(value)

@@ -12,7 +12,7 @@ from tlf_env.common.errors import shown
 from tlf_env.common.trust import Trust
 from tlf_env.engine.arrays import Arrays
 from tlf_env.hosting.host import close_policy, give_policy_state, named_policy, policy_state
-from tlf_env.onboard.parts import Policy, make_part, part_name, predicted
+from tlf_env.onboard.parts import Policy, check_trust, make_part, part_name, predicted
 from tlf_env.task.actions import ACTION_SIZE
 from tlf_env.task.scenario import Scenario
 
@@ -47,8 +47,10 @@ def make_base(scenario: Scenario, given: Any = None, *, trust: Trust) -> Outside
     Raises
     ------
     ValueError
-        for a policy that cannot or may not be imported, cannot be made, or has no ``predict``.
+        for a policy that cannot or may not be imported, cannot be made, or has no ``predict``; and for another
+        ``trust``, also where there is no policy.
     """
+    check_trust({}, trust)
     path = scenario.outside_base
     if path is None:
         return None

@@ -14,7 +14,7 @@ from gymnasium.utils import seeding
 from pettingzoo import ParallelEnv
 from pettingzoo.utils.conversions import parallel_to_aec
 
-from tlf_env.common.errors import shown
+from tlf_env.common.errors import is_one_of, shown
 from tlf_env.common.trust import Trust
 from tlf_env.disturbances.channels import CHANNELS
 from tlf_env.engine.formation import STATE_LIMITS, STATE_SCALES, Formation, state_dtype
@@ -95,7 +95,9 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
         overrides, parts = separate_parts(overrides)
         if adversary is not None:
             if not callable(adversary):
-                raise ValueError(f"adversary {adversary!r} must be callable with the environment")
+                raise ValueError(
+                    f"adversary {shown(adversary)} must be callable with the environment"
+                )
             overrides["adversary"] = True
         self._info_keys = chosen_keys(infos)
         channels = {channel.key: i for i, channel in enumerate(CHANNELS)}
@@ -112,9 +114,9 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             "is_parallelizable": True,
             "render_fps": 1 / self.scenario.control_period_s,
         }
-        if render_mode not in (None, *RENDER_MODES):
+        if render_mode is not None and not is_one_of(render_mode, RENDER_MODES):
             raise ValueError(
-                f"render_mode {render_mode!r} is not one of {', '.join(RENDER_MODES)}, None"
+                f"render_mode {shown(render_mode)} is not one of {', '.join(RENDER_MODES)}, None"
             )
         self.render_mode = render_mode
         self.possible_agents = [f"robot_{i}" for i in range(self.scenario.robot_count)]
@@ -391,7 +393,7 @@ class FormationParallelEnv(ParallelEnv[Agent, np.ndarray, np.ndarray]):
             )
         unknown = [agent for agent in actions if agent not in self.agents]
         missing = [agent for agent in self.agents if agent not in actions]
-        what = f"{unknown[0]!r} is not an agent" if unknown else f"no action for {missing[0]}"
+        what = f"{shown(unknown[0])} is not an agent" if unknown else f"no action for {missing[0]}"
         raise ValueError(f"{what}; the agents are {', '.join(self.agents)}")
 
     def _seen(self) -> np.ndarray:

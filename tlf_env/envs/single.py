@@ -12,6 +12,7 @@ import gymnasium
 import numpy as np
 from gymnasium.envs.registration import EnvSpec
 
+from tlf_env.common.errors import is_one_of, shown
 from tlf_env.common.trust import Trust
 from tlf_env.engine.snapshot import Snapshot, checked_generator, checked_snapshot
 from tlf_env.envs.parallel import FormationParallelEnv
@@ -114,8 +115,8 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
         agents = self.formation_env.possible_agents
         if learner is None:
             learner = agents[min(1, len(agents) - 1)]
-        if learner not in agents:
-            raise ValueError(f"learner {learner!r} is not one of {', '.join(agents)}")
+        if not is_one_of(learner, agents):
+            raise ValueError(f"learner {shown(learner)} is not one of {', '.join(agents)}")
         self.learner = learner
         self.render_mode = render_mode
         self.metadata = dict(self.formation_env.metadata)
@@ -134,17 +135,17 @@ class FormationEnv(HasSpec, gymnasium.Env[np.ndarray, np.ndarray]):
 
     @staticmethod
     def _make_driver(others: str | Policy, trust: Trust) -> Policy | None:
-        if others == BY_REFERENCE:
+        if is_one_of(others, [BY_REFERENCE]):
             return None
         driver: Any = others
         if isinstance(others, str):
             if ":" not in others:
                 raise ValueError(
-                    f"others {others!r} must be {BY_REFERENCE!r}, 'module:factory' or an object"
+                    f"others {shown(others)} must be {BY_REFERENCE!r}, 'module:factory' or an object"
                 )
             driver = named_policy(DRIVER, others, ACTION_SIZE, trust=trust)
         if isinstance(driver, type) or not hasattr(driver, "predict"):
-            raise ValueError(f"others {driver!r} has no predict()")
+            raise ValueError(f"others {shown(driver)} has no predict()")
         return cast(Policy, driver)
 
     @property

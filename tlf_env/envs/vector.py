@@ -13,7 +13,7 @@ from gymnasium.utils import seeding
 from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
-from tlf_env.common.errors import shown
+from tlf_env.common.errors import is_one_of, shown
 from tlf_env.common.trust import Trust
 from tlf_env.engine import judging
 from tlf_env.engine.batch import DOUBLE, BatchPlant, checked_count
@@ -126,7 +126,7 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
             overrides |= shortened(scenario, max_episode_steps, overrides)
         self.plant = BatchPlant(
             scenario,
-            num_envs,
+            checked_count("num_envs", num_envs),
             threads=threads,
             mixture=mixture,
             staggered=staggered,
@@ -147,17 +147,23 @@ class FormationVectorEnv(HasSpec, VectorEnv[np.ndarray, np.ndarray, np.ndarray])
         robots = self.scenario.robot_count
         agents = [f"robot_{i}" for i in range(robots)]
         learner = agents[min(1, robots - 1)] if learner is None else learner
-        if learner not in agents:
-            raise ValueError(f"learner {learner!r} is not one of {', '.join(agents)}")
-        if others != BY_REFERENCE:
-            raise ValueError(f"others {others!r} must be {BY_REFERENCE!r} in a vector environment")
+        if not is_one_of(learner, agents):
+            raise ValueError(f"learner {shown(learner)} is not one of {', '.join(agents)}")
+        if not is_one_of(others, [BY_REFERENCE]):
+            raise ValueError(
+                f"others {shown(others)} must be {BY_REFERENCE!r} in a vector environment"
+            )
         if render_mode is not None:
-            raise ValueError(f"render_mode {render_mode!r} must be None in a vector environment")
+            raise ValueError(
+                f"render_mode {shown(render_mode)} must be None in a vector environment"
+            )
         try:
             self.autoreset_mode = AutoresetMode(autoreset_mode)
         except ValueError as error:
             modes = ", ".join(mode.value for mode in AutoresetMode)
-            raise ValueError(f"autoreset_mode {autoreset_mode!r} is not one of {modes}") from error
+            raise ValueError(
+                f"autoreset_mode {shown(autoreset_mode)} is not one of {modes}"
+            ) from error
         self.learner = learner
         self._robot = agents.index(learner)
         self.plant.compute_time_gap_of([self._robot] if TIME_GAP_KEY in self._info_keys else [])

@@ -11,6 +11,7 @@ import math
 
 import numpy as np
 
+from tlf_env.common.errors import shown
 from tlf_env.numerics.compiled import law, law_in_double
 from tlf_env.numerics.trig import log, sincos
 
@@ -110,5 +111,5 @@ def checked_seed(seed: int) -> int:
         or not isinstance(seed, int | np.integer)
         or not 0 <= seed <= MAX_SEED
     ):
-        raise ValueError(f"seed {seed!r} must be a whole number from 0 to {MAX_SEED}")
+        raise ValueError(f"seed {shown(seed)} must be a whole number from 0 to {MAX_SEED}")
     return int(seed)

@@ -22,7 +22,7 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from tlf_env.common.errors import shown
+from tlf_env.common.errors import is_one_of, shown
 from tlf_env.common.models import as_float, is_number
 from tlf_env.common.trust import ISOLATED, Trust
 from tlf_env.onboard.observer import Message, Reference
@@ -132,7 +132,7 @@ def check_trust(code: Mapping[str, str], trust: Trust) -> None:
     ValueError
         in one line that names the first part and how to allow it.
     """
-    if not isinstance(trust, bool) and trust != ISOLATED:
+    if not isinstance(trust, bool) and not is_one_of(trust, [ISOLATED]):
         raise ValueError(f"trust {shown(trust)} must be True, False or {ISOLATED!r}")
     for role, path in code.items():
         if not trust and path not in PYTHON_ESTIMATORS.values():

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from tlf_env.common.errors import install_command
+from tlf_env.common.errors import install_command, is_one_of, shown
 from tlf_env.engine.formation import Formation
 from tlf_env.physics.shapes import Kind, PlacedShape
 from tlf_env.physics.vehicle import RobotParameters
@@ -132,8 +132,8 @@ class Renderer:
         table: bool = True,
         smallest_text: float = SMALLEST_TEXT,
     ) -> None:
-        if mode not in RENDER_MODES:
-            raise ValueError(f"mode {mode!r} is not one of {', '.join(RENDER_MODES)}")
+        if not is_one_of(mode, RENDER_MODES):
+            raise ValueError(f"mode {shown(mode)} is not one of {', '.join(RENDER_MODES)}")
         if min(size_px) < SMALLEST_PX:
             raise ValueError(f"size_px {size_px} must be at least {SMALLEST_PX} each way")
         self.pg = self._pg = import_pygame()
