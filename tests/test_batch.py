@@ -388,7 +388,7 @@ def test_bad_seeds_and_masks_are_named():
     for seed in (-1, 2**63 - 1, [1], [0, -1], 0.5):
         with pytest.raises(ValueError, match="seed"):
             plant.reset(seed)
-    for mask in (np.ones(3, dtype=bool), np.ones(2)):
+    for mask in (np.ones(3, dtype=bool), np.ones(2), [[True], None], "yes"):
         with pytest.raises(ValueError, match="mask must be"):
             plant.reset(0, mask)
 

@@ -602,7 +602,12 @@ class BatchPlant:
     def _checked_mask(self, mask: np.ndarray | None) -> np.ndarray:
         if mask is None:
             return np.ones(self.formations, dtype=np.bool_)
-        chosen = np.asarray(mask)
+        try:
+            chosen = np.asarray(mask)
+        except ValueError as error:  # of lists of different lengths
+            raise ValueError(
+                f"mask must be ({self.formations},) bool, got {shown(mask)}"
+            ) from error
         if chosen.shape != (self.formations,) or chosen.dtype != np.bool_:
             raise ValueError(
                 f"mask must be ({self.formations},) bool, got {chosen.shape} {chosen.dtype}"

@@ -6,6 +6,7 @@ import contextlib
 import math
 import os
 import tempfile
+import traceback
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -13,6 +14,7 @@ from typing import Any
 import numpy as np
 from campaign.fuzzing.registry import ViolationError
 
+import baselines
 import tlf_env
 from tlf_env.task.observation import OBSERVATION_LIMIT
 from tlf_env.task.scenario import Scenario
@@ -20,18 +22,35 @@ from tlf_env.task.scenario import Scenario
 MOST_LINE = 3000  # characters of an error
 
 REFUSED = object()
+PACKAGES = [Path(str(one.__file__)).parent for one in (tlf_env, baselines)]
 
 
 def in_one_line(error: BaseException) -> None:
-    """Check that an error says something, in one line."""
+    """Check that an error says something, in one line, and that it was raised on purpose."""
     said = str(error)
     kind = type(error).__name__
+    place = accidental(error)
+    if place:
+        raise ViolationError(f"a {kind} that nothing raises, {place}", said[:500]) from error
     if not said.strip():
         raise ViolationError(f"a {kind} without a message")
     if len(said.splitlines()) > 1:
         raise ViolationError(f"a {kind} of several lines", repr(said[:500])) from error
     if len(said) > MOST_LINE:
         raise ViolationError(f"a {kind} of more than {MOST_LINE} characters", said[:200]) from error
+
+
+def accidental(error: BaseException) -> str:
+    """Where an error came up in the package without a ``raise``; empty if it was raised, or came up elsewhere.
+
+    It is the error of a library in C, or of Python, and does not say which value is wrong.
+    """
+    frames = traceback.extract_tb(error.__traceback__)
+    if not frames or not any(Path(frames[-1].filename).is_relative_to(one) for one in PACKAGES):
+        return ""
+    last = frames[-1]
+    is_raised = (last.line or "").startswith("raise")
+    return "" if is_raised else f"{Path(last.filename).name}: {last.line}"
 
 
 def refused(make: Callable[[], Any], *more: type[BaseException]) -> Any:
