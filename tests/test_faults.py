@@ -381,6 +381,46 @@ def test_a_file_appears_whole_with_its_name(unnamed, tmp_path, monkeypatch):
     assert {one.name for one in tmp_path.iterdir()} == {"one.txt", "two.txt"}
 
 
+def test_a_pipe_or_a_device_is_written_into_and_stays(tmp_path):
+    """A file that takes the place of /dev/null would be in the way of every program."""
+    pipe = tmp_path / "pipe"
+    os.mkfifo(pipe)
+    reader = os.open(pipe, os.O_RDONLY | os.O_NONBLOCK)
+    with atomic(pipe) as file:
+        file.write("whole")
+    assert os.read(reader, 100) == b"whole"
+    with pytest.raises(FileExistsError), atomic(pipe, exclusive=True) as file:
+        file.write("new")
+    os.close(reader)
+    assert pipe.is_fifo()
+    assert list(tmp_path.iterdir()) == [pipe]
+    with atomic(Path(os.devnull), "wb") as file:
+        file.write(b"whole")
+    assert Path(os.devnull).is_char_device()
+
+
+@pytest.mark.parametrize("redirected", [True, False])
+def test_standard_output_can_be_named_as_a_file(redirected, tmp_path):
+    code = """
+from pathlib import Path
+from tlf_env.common.files import atomic
+
+print("before", flush=True)
+with atomic(Path("/dev/stdout")) as file:
+    file.write("whole")
+"""
+    link = Path("/dev/stdout").readlink()
+    with (tmp_path / "out").open("w") as out:
+        ended = subprocess.run(
+            [sys.executable, "-c", code],
+            check=True,
+            stdout=out if redirected else subprocess.PIPE,
+        )
+    written = (tmp_path / "out").read_bytes() if redirected else ended.stdout
+    assert written == b"before\nwhole"
+    assert Path("/dev/stdout").readlink() == link
+
+
 def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
     seen = []
     monkeypatch.setattr(files.os, "fsync", lambda handle: seen.append(list(tmp_path.iterdir())))

@@ -26,7 +26,8 @@ def atomic(
     """Open a file for writing; it appears under its name only when it is complete.
 
     Where the system has files without a name (Linux, on most file systems) a killed writer leaves nothing
-    behind; elsewhere it leaves a hidden file.
+    behind; elsewhere it leaves a hidden file. A device or a pipe, as ``/dev/null``, is written into: a file in
+    its place would end it for all.
 
     Parameters
     ----------
@@ -43,6 +44,13 @@ def atomic(
         if it is exclusive, and there is such a file.
     """
     temporary = path.parent / f".{path.name}.{secrets.token_hex(4)}"
+    if _is_device(path) and not exclusive:
+        with (
+            naming(path),
+            os.fdopen(os.open(path, os.O_WRONLY | os.O_APPEND), mode, **options) as file,
+        ):
+            yield file
+        return
     with naming(path):
         path.parent.mkdir(parents=True, exist_ok=True)
         handle = _unnamed(path.parent)
@@ -72,6 +80,13 @@ def atomic(
         except BaseException:
             temporary.unlink(missing_ok=True)
             raise
+
+
+def _is_device(path: Path) -> bool:
+    """Whether there is a device, a pipe, or the like; ``/dev/stdout`` is one, too, wherever it leads."""
+    if path.is_symlink() and path.absolute().parts[1:2] in (("dev",), ("proc",)):
+        return path.exists()
+    return path.exists() and not path.is_file() and not path.is_dir()
 
 
 @contextmanager

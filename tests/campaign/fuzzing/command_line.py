@@ -392,6 +392,8 @@ def checked(words: list[str], found: Outcome) -> None:
             line
         ):  # the parser repeats words that it does not know
             raise ViolationError("a line that is too long", f"{line}: {said[0][:300]}")
+    if not Path(os.devnull).is_char_device():
+        raise ViolationError(f"{os.devnull} is no device any more", line)
     if found.left:
         raise ViolationError("hidden files are left", f"{line}: {found.left}")
     if not found.status and words[-1] == "--json" and "--help" not in words:
