@@ -48,7 +48,7 @@ class Robot(NamedTuple):
     """Constants of a robot with its payload. Torques in mN·mm; curves are μ_s, μ_d, v_s, v_d of Fig. 3(b)."""
 
     m: float
-    I: float  # noqa: E741  the symbol of the equations
+    I: float  # noqa: E741 - the symbol of the equations
     d: float
     q: float
     h: float

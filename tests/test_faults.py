@@ -10,6 +10,7 @@ import resource
 import signal
 import subprocess
 import sys
+import tempfile
 import threading
 import time
 import weakref
@@ -397,6 +398,17 @@ def test_a_pipe_or_a_device_is_written_into_and_stays(tmp_path):
     with atomic(Path(os.devnull), "wb") as file:
         file.write(b"whole")
     assert Path(os.devnull).is_char_device()
+
+
+@pytest.mark.skipif(not Path("/dev/shm").is_dir(), reason="no memory with this name")
+def test_a_link_below_dev_to_a_file_is_no_device():
+    with tempfile.TemporaryDirectory(dir="/dev/shm") as name:
+        link = Path(name, "link")
+        Path(name, "one.txt").write_text("first")
+        link.symlink_to("one.txt")
+        with atomic(link) as file:
+            file.write("second")
+        assert link.read_text() == "second"
 
 
 @pytest.mark.skipif(not Path("/dev/stdout").is_symlink(), reason="no link with this name")

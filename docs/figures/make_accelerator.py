@@ -50,7 +50,7 @@ def use_device() -> None:
         return of_processor(**options) if options else extending.intrinsic(*function)
 
     numba.extending.intrinsic = intrinsic
-    from tlf_env.numerics import angles, memory, trig  # noqa: F401 - here, so that `like` is the device's
+    from tlf_env.numerics import angles, memory, trig  # noqa: F401 - while `intrinsic` is that of the device
 
     numba.extending.intrinsic = of_processor  # no kernel uses those of the other modules
     from tlf_env.engine import sensors

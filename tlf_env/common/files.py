@@ -16,6 +16,7 @@ from tlf_env.common.errors import RepeatedKeyError, path_text
 
 # Answers of file systems without files that have no name, and of kernels that know none.
 NO_UNNAMED = (errno.EOPNOTSUPP, errno.EISDIR, errno.EINVAL, errno.ENOENT)
+STREAMS = (Path("/dev"), Path("/dev/fd"), Path("/proc/self/fd"))  # folders of links to what is open
 FILE_NAME = re.compile(r"\w[\w.+-]{0,99}")  # a name that can be a file's or a folder's
 
 
@@ -84,7 +85,7 @@ def atomic(
 
 def _is_device(path: Path) -> bool:
     """Whether there is a device, a pipe, or the like; ``/dev/stdout`` is one, too, wherever it leads."""
-    if path.is_symlink() and path.absolute().parts[1:2] in (("dev",), ("proc",)):
+    if path.is_symlink() and path.absolute().parent in STREAMS:
         return path.exists()
     return path.exists() and not path.is_file() and not path.is_dir()
 
